@@ -1,0 +1,126 @@
+"""The actuator: the blocks of the chain and a tuple of effects. It holds physical values in SI.
+
+A bench with fewer blocks leaves later ones out (None): a rod in a coil ends at flux density B = mu0 (H + M).
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .chain import BLOCKS, Coil, FieldCoil, Magnetostriction, Mechanics, Sensor, Source
+from .effects.base import AbstractEffect
+from .errors import ConfigurationError
+from .param import parameters_of
+from .preisach import Preisach, gaussian_lorentzian_masses
+
+
+class Actuator(eqx.Module):
+    """source -> coil <-> hysteresis -> magnetostriction -> mechanics -> sensor, and the effects that act on them.
+
+    `output`: the quantity that the sensor reads: "displacement", "flux_density" or "magnetization".
+    """
+
+    coil: Coil | FieldCoil
+    hysteresis: Preisach
+    magnetostriction: Magnetostriction | None = None
+    mechanics: Mechanics | None = None
+    source: Source = eqx.field(default_factory=Source)
+    sensor: Sensor = eqx.field(default_factory=Sensor)
+    effects: tuple[AbstractEffect, ...] = ()
+    output: str = eqx.field(static=True, default="displacement")
+
+    def with_effect(self, effect: AbstractEffect) -> "Actuator":
+        """The same actuator with one more effect; an effect of the same name is replaced."""
+        kept = tuple(e for e in self.effects if e.name != effect.name)
+        return dataclasses.replace(self, effects=(*kept, effect))
+
+    def without_effect(self, name: str) -> "Actuator":
+        """The same actuator without the effect of that name."""
+        return dataclasses.replace(self, effects=tuple(e for e in self.effects if e.name != name))
+
+    def effect(self, name: str) -> AbstractEffect:
+        """The effect of that name; raises `ConfigurationError` where there is none."""
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise ConfigurationError(f'the actuator has no effect "{name}"; it has {[e.name for e in self.effects]}')
+
+    def parameters(self) -> dict:
+        """Every declared scalar parameter: "block.name" or "effects.effect.name" -> (value, ParameterInfo)."""
+        found = {}
+        for block in BLOCKS:
+            module = getattr(self, block)
+            if module is None or block == "hysteresis":
+                continue
+            for name, info in parameters_of(module).items():
+                found[f"{block}.{name}"] = (getattr(module, name), info)
+        for effect in self.effects:
+            for name, info in effect.parameters().items():
+                found[f"effects.{effect.name}.{name}"] = (getattr(effect, name), info)
+        return found
+
+    def replace(self, values: dict) -> "Actuator":
+        """New parameter values by name, as in `parameters`; "hysteresis.masses" and ".offset" too."""
+        changed = self
+        for name, value in values.items():
+            where = _getter(changed, name)
+            changed = eqx.tree_at(where, changed, jnp.asarray(value, dtype=float))
+        return changed
+
+    def describe(self) -> str:
+        """The parameters in words, a line each."""
+        lines = [
+            f"  {name:34s} {float(np.asarray(value)):12.6g} {info.unit:14s} {info.meaning}"
+            for name, (value, info) in self.parameters().items()
+        ]
+        masses = np.asarray(self.hysteresis.masses)
+        plane = f"  hysteresis: L = {masses.shape[0]}, {float(self.hysteresis.low):.6g}..{float(self.hysteresis.high):.6g} A/m"
+        return "\n".join([f"Actuator, {self.output} out", *lines, f"{plane}, sum of masses {masses.sum():.6g} A/m"])
+
+
+def _getter(actuator, name: str):
+    parts = name.split(".")
+    if parts[0] == "effects" and len(parts) == 3:
+        index = [e.name for e in actuator.effects].index(parts[1]) if parts[1] in [e.name for e in actuator.effects] else None
+        if index is not None:
+            return lambda a: getattr(a.effects[index], parts[2])
+    elif len(parts) == 2 and hasattr(getattr(actuator, parts[0], None), parts[1]):
+        return lambda a: getattr(getattr(a, parts[0]), parts[1])
+    known = [*actuator.parameters(), "hysteresis.masses", "hysteresis.offset"]
+    raise ConfigurationError(f'no parameter "{name}"; there are {", ".join(known)}')
+
+
+def tan_baras_density(cells: int = 25, low: float = 0.0, high: float = 2.6e4, total: float = 7.87e5 / 2) -> np.ndarray:
+    """Masses of a plausible Terfenol-D rod for T&B's bench, whose Fig. 5 gives no numbers: Gaussian x Lorentzian."""
+    return gaussian_lorentzian_masses(cells, low, high, total, 0.42 * (low + high), 0.22 * (high - low), 900.0, 1100.0)
+
+
+def from_bench(bench) -> Actuator:
+    """The actuator that a bench file describes, with a starting density on the plane that its limits can reach."""
+    constants = bench.constants
+
+    def block(kind, prefix):
+        names = parameters_of(kind)
+        return kind(**{n: constants[f"{prefix}.{n}"] for n in names if f"{prefix}.{n}" in constants})
+
+    coil = block(FieldCoil if bench.drive == "field" else Coil, "coil")
+    magnetostriction = block(Magnetostriction, "magnetostriction") if "magnetostriction" in bench.blocks else None
+    mechanics = block(Mechanics, "mechanics") if "mechanics" in bench.blocks else None
+    low, high = _plane(bench, coil)
+    cells = int(bench.levels)
+    M_s = float(magnetostriction.M_s) if magnetostriction is not None else 1e6
+    start = bench.start if bench.start != "auto" else "negative_saturation"
+    masses = tan_baras_density(cells, low, high, 0.5 * M_s)
+    hysteresis = Preisach(masses, low, high, 0.5 * M_s, start)
+    return Actuator(coil, hysteresis, magnetostriction, mechanics, sensor=block(Sensor, "sensor"), output=bench.output)
+
+
+def _plane(bench, coil):
+    """Range of the Preisach plane, A/m: what the current (field) limit reaches on either side of the bias."""
+    limit = dict(bench.limits or {})
+    largest = float(limit.get("current_A", limit.get("field_A_per_m", 0.9 if bench.drive == "current" else 300.0)))
+    ends = [float(coil.applied_field(jnp.asarray(sign * largest))) for sign in (-1, 1)]
+    margin = 0.01 * (ends[1] - ends[0])
+    return ends[0] - margin, ends[1] + margin

@@ -1,0 +1,27 @@
+"""Magnetostriction: magnetization M (A/m) -> free displacement u (m) of the rod.
+
+u = l_rod lambda_s (M/M_s)^2, the forcing of T&B (5) divided by w0^2.
+Left out: the fourth power (quartic_magnetostriction), a linear part (linear_strain), hysteresis of its own (strain_hysteresis).
+"""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from ..param import param
+
+
+class Magnetostriction(eqx.Module):
+    """The quadratic law of T&B (5)."""
+
+    lambda_s: Float[Array, ""] = param(1.313e-3, "1", "saturation magnetostriction", low=0.0)
+    M_s: Float[Array, ""] = param(7.87e5, "A/m", "saturation magnetization", low=0.0)
+    l_rod: Float[Array, ""] = param(5.13e-2, "m", "length of the rod", low=0.0)
+
+    @property
+    def reach(self):
+        """Free displacement at saturation, l_rod lambda_s, m."""
+        return self.l_rod * self.lambda_s
+
+    def __call__(self, magnetization):
+        """Free displacement, m."""
+        return self.reach * (magnetization / self.M_s) ** 2

@@ -1,0 +1,94 @@
+"""What an effect is: one piece of physics in one block that T&B leave out.
+
+At its null the extended model is bit-identical to the base: write laws in increment form, x + k * (...). An effect
+overrides the hooks of its block only; all others are identities. Adding one is one new file and one line in CATALOGUE.
+
+hook            block                   acts on
+drive           source                  the current on its way to the coil (whole signal)
+field_shift     coil, hysteresis        the field inside the implicit step of (4)
+magnetization   hysteresis              what is added to the Preisach magnetization inside the step
+strain          magnetostriction        the free displacement (whole signal)
+displacement    mechanics               the displacement (whole signal)
+reading         sensor                  the reading (whole signal; `line.time` runs over the record for `record_level` ones)
+"""
+
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..param import parameters_of
+
+
+class Trial(NamedTuple):
+    """What an in-step effect sees at a trial value of the field: SI scalars.
+
+    `field`: the field that the relays see. `magnetization`: of the Preisach operator. `flux_rate`: dB/dt, T/s, of the
+    step. `field_rate`: of the relays' field, A/m/s. `current`: A, drive at the end of the step. `h`: step, s.
+    """
+
+    field: object
+    magnetization: object
+    flux_rate: object
+    field_rate: object
+    current: object
+    h: object
+
+
+class AbstractEffect(eqx.Module):
+    """Base of every effect. Class attributes:
+
+    `name`, `block` (one of chain.BLOCKS), `law` (the equation), `source` (literature), `signature` (how it shows in
+    data), `in_step` (solved inside the step of (4)), `record_level` (acts on the whole record, not period by period),
+    `amplitude` (the parameter whose null removes the effect).
+    """
+
+    name: ClassVar[str] = ""
+    block: ClassVar[str] = ""
+    law: ClassVar[str] = ""
+    source: ClassVar[str] = ""
+    signature: ClassVar[str] = ""
+    amplitude: ClassVar[str] = ""
+    in_step: ClassVar[bool] = False
+    record_level: ClassVar[bool] = False
+
+    def with_amplitude(self, value):
+        """The same effect with its amplitude parameter replaced."""
+        return eqx.tree_at(lambda e: getattr(e, self.amplitude), self, jnp.asarray(value, dtype=float))
+
+    @classmethod
+    def parameters(cls):
+        """Declared parameters: name -> ParameterInfo."""
+        return parameters_of(cls)
+
+    def drive(self, current, line, actuator):
+        """Current after this effect, A, (time,)."""
+        return current
+
+    def start(self, trial: Trial, actuator):
+        """Internal state at equilibrium before the first step: any tuple of scalars."""
+        return ()
+
+    def field_shift(self, trial: Trial, state, actuator):
+        """What must be added to the relays' field to give the field H in (4), A/m; a loss if the block is the coil."""
+        return jnp.zeros_like(trial.field)
+
+    def magnetization(self, trial: Trial, state, actuator):
+        """Magnetization beside the Preisach operator's, A/m."""
+        return jnp.zeros_like(trial.field)
+
+    def advance(self, trial: Trial, state, actuator):
+        """Internal state after the step."""
+        return state
+
+    def strain(self, free_displacement, magnetization, field, line, actuator):
+        """Free displacement after this effect, m, (time,)."""
+        return free_displacement
+
+    def displacement(self, displacement, free_displacement, signals, line, actuator):
+        """Displacement after this effect, m, (time,); `signals` holds current, field, magnetization, flux_density."""
+        return displacement
+
+    def reading(self, reading, signals, line, actuator):
+        """Reading after this effect, unit of the sensor, (time,)."""
+        return reading

@@ -1,0 +1,25 @@
+"""Errors that tell the mend: one line each, with the exit status that the command line returns."""
+
+
+class MagjaxError(Exception):
+    """Base of every error a user can cause; `exit_status` is what the command line returns."""
+
+    exit_status = 2
+
+
+class ConfigurationError(MagjaxError):
+    """Wrong use or a wrong bench file (exit status 2)."""
+
+    exit_status = 2
+
+
+class RecordingError(MagjaxError):
+    """A recording that cannot be used as it is (exit status 3)."""
+
+    exit_status = 3
+
+
+class DeviceError(MagjaxError):
+    """A port or device that does not answer as it should (exit status 5)."""
+
+    exit_status = 5

@@ -1,0 +1,84 @@
+"""The Preisach operator of T&B Sec. 2.1: field H in, magnetization M out, both A/m.
+
+The Preisach plane beta <= alpha between `low` and `high` is cut at level L into cells; `masses[i, j]` is the mass of
+the relays with alpha in row i and beta in column j <= i. With the default surrogate "uniform" each mass is spread
+evenly over its cell (T&B Fig. 5), which makes M continuous and differentiable: it is the smooth form of the relay array.
+Left out: reversible magnetization, mean field, stress, after-effect, accommodation (effects of those names add them).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..errors import ConfigurationError
+from ..param import as_float_array
+from .everett import everett_table
+from .memory import apply_field, memory_after, start_history
+from .relays import relay_magnetization
+
+
+class Preisach(eqx.Module):
+    """A Preisach operator at discretization level L.
+
+    `masses`: (L, L), A/m, [alpha row, beta column], zero above the diagonal; M runs between `offset` - sum and
+    `offset` + sum. `low`, `high`: range of the plane, A/m. `start`: the state before the drive, kept as the history of
+    fields that makes it: "negative_saturation", "positive_saturation", "demagnetized" or an array of fields, A/m.
+    """
+
+    masses: Float[Array, "L L"]
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+    offset: Float[Array, ""] 
+    history: Float[Array, " extrema"]
+
+    def __init__(self, masses, low, high, offset=0.0, start="negative_saturation"):
+        masses = as_float_array(masses)
+        if masses.ndim != 2 or masses.shape[0] != masses.shape[1]:
+            raise ConfigurationError(f"hysteresis.masses must be L x L (alpha rows, beta columns), not {masses.shape}")
+        if float(jnp.min(masses)) < 0:
+            row, column = np.unravel_index(int(jnp.argmin(masses)), masses.shape)
+            raise ConfigurationError(f"hysteresis.masses[{row}, {column}] is negative; masses must be nonnegative")
+        if not high > low:
+            raise ConfigurationError(f"the Preisach plane {low}..{high} A/m is empty; give low < high")
+        self.masses = masses
+        self.low, self.high, self.offset = as_float_array(low), as_float_array(high), as_float_array(offset)
+        self.history = as_float_array(start_history(start, float(low), float(high)))
+
+    @property
+    def cells(self) -> int:
+        """The level L of discretization."""
+        return self.masses.shape[0]
+
+    @property
+    def levels(self):
+        """The L + 1 thresholds between cells, A/m."""
+        return self.low + (self.high - self.low) * jnp.arange(self.cells + 1) / self.cells
+
+    def table(self):
+        """The Everett table that steps read."""
+        return everett_table(self.masses, self.low, self.high, self.offset)
+
+    def memory(self, table, corners: int):
+        """The memory at the start, with room for `corners` pairs at least."""
+        return memory_after(table, self.history, max(corners, self.history.shape[0] // 2 + 2))
+
+    def magnetization(self, field: Float[Array, " time"], surrogate: str = "uniform", corners: int = 16):
+        """M over time for a field sequence, A/m, from the start state.
+
+        `surrogate`: "uniform" (exact for the piecewise-uniform measure), "kp" (finite-slope relays of one cell) or
+        "hard" (point relays at the cell centres). Overflow of the memory raises.
+        """
+        field = jnp.asarray(field, dtype=float)
+        if surrogate != "uniform":
+            return relay_magnetization(self, field, surrogate)
+        table = self.table()
+        memory = self.memory(table, corners)
+
+        def advance(memory, value):
+            memory = apply_field(table, memory, value)
+            return memory, memory.magnetization
+
+        memory, m = jax.lax.scan(advance, memory, field)
+        return eqx.error_if(m, memory.overflow, f"the field leaves more than {corners} nested corners; raise corners")
