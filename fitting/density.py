@@ -1,0 +1,132 @@
+"""The density as the fit sees it: hats on knots in mean field and coercive field, nonnegative, with roughness penalties.
+
+Coordinates s = (alpha + beta)/2 and r = (alpha - beta)/2; knots uniform in s and dense near r = 0 (r = R u^1.6).
+One column of cells below every recorded field is kept apart: its relays switch up once and stay, which lets the
+level of M depend on a recording's highest field without asking for its past.
+"""
+
+import dataclasses
+
+import numpy as np
+
+R_EXPONENT = 1.6
+
+
+@dataclasses.dataclass(frozen=True)
+class DensityBasis:
+    """masses = total * (cells @ x) on an (L+1) x (L+1) plane whose column 0 holds the once-switching relays.
+
+    `low`, `high`: range of that plane, A/m; `cells`: ((L+1)^2, unknowns), unit-free; `penalties`: one matrix of
+    second differences per family (along s, along r, along the once-switching column); `total`: A/m;
+    `flat`: the unknowns of a uniform density of mass `total`.
+    """
+
+    low: float
+    high: float
+    size: int
+    cells: np.ndarray
+    penalties: tuple[np.ndarray, ...]
+    total: float
+    flat: np.ndarray
+    knots_s: int
+    knots_r: int
+
+    @property
+    def unknowns(self) -> int:
+        """How many unknowns the density has."""
+        return self.cells.shape[1]
+
+    def masses(self, x) -> np.ndarray:
+        """The (L+1, L+1) mass array, A/m."""
+        return (self.total * (self.cells @ np.asarray(x))).reshape(self.size, self.size)
+
+
+def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: int = 18, knots_r: int = 13) -> DensityBasis:
+    """Bilinear hats for fields between `low` and `high` (A/m) at level `level`, and the once-switching column."""
+    step = (high - low) / level
+    size, refine = level + 1, 4
+    points = low + step * (np.arange(level * refine) + 0.5) / refine
+    alpha, beta = np.meshgrid(points, points, indexing="ij")
+    inside = alpha >= beta
+    weight = np.where(inside, 1.0, 0.0)
+    weight[np.diag_indices(len(points))] = 0.5
+    s, r = 0.5 * (alpha + beta), 0.5 * (alpha - beta)
+    s_knots = np.linspace(low, high, knots_s)
+    r_knots = 0.5 * (high - low) * np.linspace(0, 1, knots_r) ** R_EXPONENT
+    hats_s, hats_r = _hats(s[inside], s_knots), _hats(r[inside], r_knots)
+    row, column = (k[inside] // refine for k in np.indices(s.shape))
+    cell = (row + 1) * size + (column + 1)
+    number, columns = {}, []
+    for a in range(knots_s):
+        for b in range(knots_r):
+            value = hats_s[:, a] * hats_r[:, b] * weight[inside]
+            mass = np.bincount(cell, value, size * size)
+            if mass.sum() > 1e-3:
+                number[a, b] = len(columns)
+                columns.append(mass)
+    area = sum(c.sum() for c in columns)
+    columns = [c / area for c in columns]
+    main = len(columns)
+    once = _hats(low + step * (np.arange(level) + 0.5), np.linspace(low, high, max(6, knots_s // 2)))
+    for k in range(once.shape[1]):
+        mass = np.zeros((size, size))
+        mass[1:, 0] = once[:, k] / level
+        columns.append(mass.ravel())
+    cells = np.stack(columns, axis=1)
+    penalties = [
+        _differences([[number.get((a + d, b)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
+        _differences([[number.get((a, b + d)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
+        _differences([[main + k - 1, main + k, main + k + 1] for k in range(1, once.shape[1] - 1)], cells.shape[1], ridge=range(main, cells.shape[1])),
+    ]
+    flat = np.ones(cells.shape[1])
+    flat[main:] = 0.05
+    return DensityBasis(low - step, high, size, cells, tuple(penalties), total, flat, knots_s, knots_r)
+
+
+def _hats(x, knots):
+    """Linear hat functions on knots, (points, knots)."""
+    return np.stack([np.interp(x, knots, row) for row in np.eye(len(knots))], axis=1)
+
+
+def _differences(triples, unknowns, ridge=()):
+    """Rows of second differences for every complete triple of unknowns, and of first for a ridge."""
+    rows = []
+    for triple in triples:
+        if all(k is not None for k in triple):
+            row = np.zeros(unknowns)
+            row[triple] = (1.0, -2.0, 1.0)
+            rows.append(row)
+    for k in ridge:
+        row = np.zeros(unknowns)
+        row[k] = 0.3
+        rows.append(row)
+    return np.stack(rows)
+
+
+def cell_basis(low: float, high: float, total: float, level: int) -> DensityBasis:
+    """One unknown a cell, the form of T&B Sec. 2.1, with the once-switching column; penalties along s and r."""
+    size = level + 1
+    number, columns = {}, []
+    area = level * level / 2
+    for i in range(level):
+        for j in range(i + 1):
+            mass = np.zeros((size, size))
+            mass[i + 1, j + 1] = (0.5 if i == j else 1.0) / area
+            number[i, j] = len(columns)
+            columns.append(mass.ravel())
+    main = len(columns)
+    for i in range(level):
+        mass = np.zeros((size, size))
+        mass[i + 1, 0] = 1.0 / level
+        columns.append(mass.ravel())
+    cells = np.stack(columns, axis=1)
+    along_s = [[number.get((i + d, j + d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
+    along_r = [[number.get((i + d, j - d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
+    once = [[main + k - 1, main + k, main + k + 1] for k in range(1, level - 1)]
+    penalties = tuple(
+        _differences(t, cells.shape[1], ridge) for t, ridge in ((along_s, ()), (along_r, ()), (once, range(main, cells.shape[1])))
+    )
+    flat = np.ones(cells.shape[1])
+    flat[main:] = 0.05
+    step = (high - low) / level
+    return DensityBasis(low - step, high, size, cells, penalties, total, flat, level, level)

@@ -1,0 +1,174 @@
+"""From unknowns to predicted harmonics: the differentiable half of the fit.
+
+`Layout` orders the flat vector of unknowns: density, the level of M at the bottom of the plane, free physical
+parameters in the optimiser's coordinates (log for positive ones). `Predictor` simulates the steady state of every
+recording on a period grid and returns the whitened misfit of the reading's harmonics, prior rows below.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from magjax.preisach import Preisach
+from magjax.simulate import run_chain
+
+from .density import DensityBasis
+
+
+class Layout(eqx.Module):
+    """Order of the unknowns: [density, bottom of M / total, free physical parameters in the optimiser's coordinates].
+
+    A parameter is start * exp(z) where it must stay positive (`log`), else start + scale * z. The arrays are traced,
+    so that fits of the same shape share one compiled program.
+    """
+
+    cells: jax.Array
+    penalties: tuple[jax.Array, ...]
+    total: jax.Array
+    starts: jax.Array
+    scales: jax.Array
+    names: tuple[str, ...] = eqx.field(static=True)
+    log: tuple[bool, ...] = eqx.field(static=True)
+
+    @staticmethod
+    def build(basis, names, starts, scales, log) -> "Layout":
+        """From a density basis and the free parameters' names, start values, scales and coordinate kinds."""
+        return Layout(
+            jnp.asarray(basis.cells), tuple(jnp.asarray(D) for D in basis.penalties), jnp.asarray(basis.total),
+            jnp.asarray(starts, dtype=float), jnp.asarray(scales, dtype=float), tuple(names), tuple(log),
+        )  # fmt: skip
+
+    @property
+    def density_unknowns(self) -> int:
+        """How many of the unknowns are the density's."""
+        return self.cells.shape[1]
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.density_unknowns + 1 + len(self.names)
+
+    @property
+    def nonnegative(self) -> np.ndarray:
+        """Which unknowns must not be negative."""
+        return np.arange(self.size) < self.density_unknowns
+
+    def index(self, name: str) -> int:
+        """Where a parameter stands in the vector."""
+        return self.density_unknowns + 1 + self.names.index(name)
+
+    def value(self, name: str, z):
+        """A parameter in SI."""
+        k = self.names.index(name)
+        z = z[self.density_unknowns + 1 + k]
+        return self.starts[k] * jnp.exp(z) if self.log[k] else self.starts[k] + self.scales[k] * z
+
+    def slope(self, name: str, z) -> float:
+        """d value / d z."""
+        k = self.names.index(name)
+        return float(self.value(name, z)) if self.log[k] else float(self.scales[k])
+
+    def coordinate(self, name: str, value: float) -> float:
+        """The optimiser's coordinate of a value in SI."""
+        k = self.names.index(name)
+        if self.log[k]:
+            return float(np.log(value / self.starts[k]))
+        return float((value - self.starts[k]) / self.scales[k])
+
+    def actuator(self, template, z):
+        """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable)."""
+        n = self.density_unknowns
+        side = int(round(self.cells.shape[0] ** 0.5))
+        masses = (self.total * (self.cells @ z[:n])).reshape(side, side)
+        offset = self.total * z[n] + jnp.sum(masses)
+        template = eqx.tree_at(lambda a: (a.hysteresis.masses, a.hysteresis.offset), template, (masses, offset))
+        values = {name: self.value(name, z) for name in self.names}
+        return template.replace(values) if values else template
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The recordings that share a period grid: drive samples (recordings, grid), steps (s), place among all."""
+
+    drive: np.ndarray
+    dt: np.ndarray
+    index: np.ndarray
+
+
+def period_grids(spectra, samples: int) -> tuple[Grid, ...]:
+    """Recordings grouped by how fine a grid their drive needs; `samples` points a period of the highest strong line."""
+    groups: dict[int, list[int]] = {}
+    for k, s in enumerate(spectra):
+        power = np.abs(s.drive[1:]) ** 2
+        strong = np.flatnonzero(power > 1e-3 * power.max())
+        factor = int(2 ** np.ceil(np.log2(max(1, strong.max() + 1) / 1.5))) if strong.max() else 1
+        groups.setdefault(samples * min(factor, 8), []).append(k)
+    grids = []
+    for n, members in groups.items():
+        drive = np.stack([spectra[k].drive_at(np.arange(n) / n) for k in members])
+        dt = np.asarray([1 / (spectra[k].frequency * n) for k in members])
+        grids.append(Grid(drive, dt, np.asarray(members)))
+    return tuple(grids)
+
+
+class Predictor(eqx.Module):
+    """Predicted reading harmonics of all recordings for an actuator."""
+
+    drives: tuple[jax.Array, ...]
+    steps: tuple[jax.Array, ...]
+    index: tuple[int, ...] = eqx.field(static=True)
+    harmonics: int = eqx.field(static=True)
+    periods: int = eqx.field(static=True)
+    corners: int = eqx.field(static=True)
+
+    @staticmethod
+    def build(spectra, samples: int, harmonics: int, periods: int, corners: int) -> "Predictor":
+        """For spectra on grids of `samples` points a period of the fastest strong line."""
+        grids = period_grids(spectra, samples)
+        order = np.argsort(np.concatenate([g.index for g in grids]))
+        return Predictor(
+            tuple(jnp.asarray(g.drive) for g in grids), tuple(jnp.asarray(g.dt) for g in grids),
+            tuple(int(k) for k in order), harmonics, periods, corners,
+        )  # fmt: skip
+
+    def __call__(self, actuator):
+        """Complex Fourier coefficients 0..harmonics of the reading, (recordings, harmonics + 1)."""
+
+        def one(drive, dt):
+            signals = run_chain(actuator, drive, dt, self.periods, self.corners, "trapezoid")
+            return jnp.fft.rfft(signals.reading)[: self.harmonics + 1] / drive.shape[0]
+
+        parts = [jax.vmap(one)(drive, dt) for drive, dt in zip(self.drives, self.steps, strict=True)]
+        return jnp.concatenate(parts)[np.asarray(self.index)]
+
+
+class Target(eqx.Module):
+    """What the predictor must meet: measured lines, their deviations, and the prior's weights."""
+
+    lines: jax.Array  # (recordings, harmonics + 1) complex
+    deviations: jax.Array  # (recordings, harmonics + 1), inf where a line is not measured
+    weights: jax.Array  # one per penalty family
+    priors: jax.Array  # 1 / standard deviation in optimiser units per coordinate, 0 where free
+    bottom_prior: jax.Array
+
+
+def whitened(lines, target: Target):
+    """Real residual vector of complex lines: (model - measured) / deviation, mean lines real."""
+    misfit = (lines - target.lines) / target.deviations
+    return jnp.concatenate([misfit.real.ravel(), misfit[:, 1:].imag.ravel()])
+
+
+def prior_rows(layout: Layout, z, target: Target):
+    """Residuals of the prior: roughness of the density, and the stated priors of parameters."""
+    n = layout.density_unknowns
+    rows = [jnp.sqrt(target.weights[k]) * (D @ z[:n]) for k, D in enumerate(layout.penalties)]
+    return jnp.concatenate([*rows, target.priors * z[n + 1 :], target.bottom_prior * z[n : n + 1]])
+
+
+def make_start_actuator(template, basis: DensityBasis):
+    """`template` with a plane that fits the basis (uniform masses)."""
+    hysteresis = Preisach(basis.masses(basis.flat), basis.low, basis.high, 0.0)
+    return eqx.tree_at(lambda a: a.hysteresis, template, hysteresis)

@@ -1,0 +1,143 @@
+"""Projected Levenberg-Marquardt for bounded, scaled least squares, behind optimistix's interface.
+
+optimistix brings no bounds and one Jacobian a trial; here the nonnegative unknowns are kept by block pivoting on the
+normal equations, the Jacobian is built in chunks of columns by `linearize`, may come from a coarser grid than the
+residual (`options["jacobian_fn"]`), and one step is one Jacobian with as many trial dampings as it needs.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array
+
+CHUNK = 40
+
+
+class ProjectedState(eqx.Module):
+    """What a step carries: damping, cost (half the sum of squares), the normal matrix and gradient of the last step."""
+
+    damping: Array
+    cost: Array
+    decrement: Array
+    normal: Array
+    gradient: Array
+    steps: Array
+    done: Array
+    stalled: Array
+
+
+class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt on a flat vector with `y[i] >= 0` where `nonnegative[i]`.
+
+    Stops when the predicted fall of half chi2 (the Newton decrement) is below `atol` + `rtol` * cost.
+    """
+
+    nonnegative: Any
+    rtol: float = 1e-5
+    atol: float = 1e-2
+    norm: Any = optx.max_norm
+    trials: int = 8
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        n = y.shape[0]
+        zero = jnp.asarray(0.0)
+        return ProjectedState(
+            damping=jnp.asarray(options.get("damping", 1e-2)), cost=jnp.asarray(jnp.inf), decrement=jnp.asarray(jnp.inf),
+            normal=jnp.zeros((n, n)), gradient=jnp.zeros(n), steps=jnp.asarray(0), done=jnp.asarray(False), stalled=zero > 1,
+        )  # fmt: skip
+
+    def step(self, fn, y, args, options, state, tags):
+        jacobian_fn = options.get("jacobian_fn", fn)
+        residual, aux = fn(y, args)
+        cost = 0.5 * jnp.sum(residual**2)
+        normal, gradient = normal_equations(lambda z: jacobian_fn(z, args)[0], y, residual)
+        scale = jnp.diagonal(normal)
+        scale = scale + 1e-12 * jnp.max(scale)
+
+        def attempt(carry):
+            damping, _, _, _, tried = carry
+            delta = bounded_step(normal + jnp.diag(damping * scale), gradient, y, self.nonnegative)
+            new = jnp.where(self.nonnegative, jnp.maximum(y + delta, 0.0), y + delta)
+            delta = new - y
+            predicted = -(gradient @ delta + 0.5 * delta @ normal @ delta)
+            new_cost = 0.5 * jnp.sum(fn(new, args)[0] ** 2)
+            ratio = (cost - new_cost) / jnp.maximum(predicted, 1e-300)
+            good = (ratio > 1e-3) & jnp.isfinite(new_cost)
+            following = jnp.where(ratio > 0.5, damping * 0.15, jnp.where(good, damping, damping * 6.0))
+            return following, jnp.where(good, new, y), jnp.where(good, new_cost, cost), good, tried + 1
+
+        start = (state.damping, y, cost, jnp.asarray(False), jnp.asarray(0))
+        damping, new, new_cost, good, _ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < self.trials), attempt, start)
+        full = bounded_step(normal + jnp.diag(1e-9 * scale), gradient, y, self.nonnegative)
+        full = jnp.where(self.nonnegative, jnp.maximum(y + full, 0.0), y + full) - y
+        decrement = -(gradient @ full + 0.5 * full @ normal @ full)
+        fallen = cost - new_cost
+        tolerance = self.atol + self.rtol * new_cost
+        done = (decrement < tolerance) | ~good
+        state = ProjectedState(
+            jnp.maximum(damping, 1e-9), new_cost, decrement, normal, gradient, state.steps + 1, done,
+            ~good & (decrement > 10 * tolerance) & (fallen <= 0),
+        )  # fmt: skip
+        return new, state, aux
+
+    def terminate(self, fn, y, args, options, state, tags):
+        result = optx.RESULTS.where(state.stalled, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        return state.done, result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return y, aux, {"decrement": state.decrement, "normal": state.normal}
+
+
+def jacobian(fn, y, chunk: int = CHUNK):
+    """The dense Jacobian of fn at y, (residuals, unknowns), in chunks of columns."""
+    _, push = jax.linearize(fn, y)
+    return jax.lax.map(push, jnp.eye(y.shape[0]), batch_size=chunk).T
+
+
+def normal_equations(fn, y, residual):
+    """J'J and J'r, the Jacobian taken of `fn` and the residual given."""
+    J = jacobian(fn, y)
+    return J.T @ J, J.T @ residual
+
+
+def bounded_step(A, gradient, y, nonnegative, rounds: int = 25):
+    """argmin of gradient'd + d'A d/2 with y + d >= 0 where asked: block principal pivoting on the free set."""
+    n = y.shape[0]
+    eye = jnp.eye(n)
+    scale = 1 / jnp.sqrt(jnp.maximum(jnp.diagonal(A), 1e-300))
+    A = A * scale[:, None] * scale[None, :]
+    g = gradient * scale
+    floor = jnp.where(nonnegative, -y, -jnp.inf) / scale
+
+    def solve(fixed):
+        held = jnp.where(fixed, floor, 0.0)
+        held = jnp.where(jnp.isfinite(held), held, 0.0)
+        free = ~fixed
+        masked = jnp.where(free[:, None] & free[None, :], A, eye)
+        rhs = jnp.where(free, -(g + A @ held), 0.0)
+        factor = jax.scipy.linalg.cho_factor(masked + 1e-13 * eye, lower=True)
+        d = jnp.where(free, jax.scipy.linalg.cho_solve(factor, rhs), held)
+        multiplier = g + A @ d
+        return d, (free & (d < floor - 1e-12)), (fixed & (multiplier < -1e-12))
+
+    def pivot(carry):
+        fixed, _, best, count, k = carry
+        d, below, wrong = solve(fixed)
+        bad = below | wrong
+        number = jnp.sum(bad)
+        # Murty's single exchange once the block exchange stops making progress
+        worst = jnp.arange(n) == (n - 1 - jnp.argmax(bad[::-1]))
+        stuck = (number >= best) & (count >= 3)
+        change = jnp.where(stuck, bad & worst, bad)
+        return fixed ^ change, d, jnp.minimum(best, number), jnp.where(number < best, 0, count + 1), k + 1
+
+    def unfinished(carry):
+        return (carry[2] > 0) & (carry[4] < rounds)
+
+    fixed = nonnegative & (y <= 0) & (gradient > 0)
+    start = (fixed, jnp.zeros(n), jnp.asarray(n + 1), jnp.asarray(0), jnp.asarray(0))
+    _, d, *_ = jax.lax.while_loop(unfinished, pivot, start)
+    return jnp.maximum(d, floor) * scale

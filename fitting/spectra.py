@@ -1,0 +1,160 @@
+"""A recording in harmonics: drive lines, the reading's harmonics, and the noise between them.
+
+A record of whole periods is reduced to its reading at the harmonics 0..H of the fundamental (least squares, so that
+periods need not divide the sampling), its drive to the significant lines, and everything else to a noise spectrum
+S(f) = white + flicker/f, estimated from the bins between the harmonics and pooled over recordings.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy.optimize import minimize
+
+HARMONICS = 40
+
+
+@dataclasses.dataclass(frozen=True)
+class Spectrum:
+    """One recording reduced to lines. SI; phases refer to the first sample.
+
+    `frequency`: fundamental, Hz; `periods`: whole periods used; `samples`: used; `dt`: s; `drive`: complex Fourier
+    coefficients of the drive, 0..; `reading`: those of the reading, 0..HARMONICS; `between_f`, `between_power`:
+    frequencies (Hz) and periodogram of the reading between the harmonics (unit^2 per bin as variance of one
+    coefficient times samples); `residue`: reading less its harmonics, (samples,).
+    """
+
+    name: str
+    frequency: float
+    periods: int
+    samples: int
+    dt: float
+    drive: np.ndarray
+    reading: np.ndarray
+    between_f: np.ndarray
+    between_power: np.ndarray
+    residue: np.ndarray
+    peak_to_peak: float
+    drive_noise: float
+    given_noise: float | None = None
+
+    def drive_at(self, phases: np.ndarray) -> np.ndarray:
+        """The drive at phases (cycles) of one period."""
+        return evaluate_lines(self.drive, phases)
+
+
+def evaluate_lines(lines: np.ndarray, phases: np.ndarray) -> np.ndarray:
+    """The real signal with Fourier coefficients `lines` (0..) at phases in cycles."""
+    used = np.flatnonzero(np.abs(lines) > 0)
+    value = np.zeros(len(phases))
+    for h in used:
+        value += (1.0 if h == 0 else 2.0) * (lines[h] * np.exp(2j * np.pi * h * phases)).real
+    return value
+
+
+def fit_lines(signal: np.ndarray, phases: np.ndarray, count: int):
+    """Fourier coefficients 0..count at the given phases (cycles) by least squares, and what they leave."""
+    n = len(signal)
+    whole = phases[-1] + (phases[1] - phases[0])
+    if abs(whole - round(whole)) < 1e-9:
+        steps = round(whole)
+        spectrum = np.fft.rfft(signal) / n
+        lines = np.zeros(count + 1, complex)
+        available = spectrum[: count * steps + 1 : steps]
+        lines[: len(available)] = available
+    else:
+        angle = 2 * np.pi * np.outer(np.arange(1, count + 1), phases)
+        design = np.concatenate([np.ones((1, n)), np.cos(angle), np.sin(angle)])
+        solution = np.linalg.solve(design @ design.T, design @ signal)
+        lines = np.concatenate([solution[:1], 0.5 * (solution[1 : count + 1] - 1j * solution[count + 1 :])])
+    return lines, signal - evaluate_lines(lines, phases)
+
+
+def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMONICS) -> Spectrum:
+    """The `Spectrum` of a periodic recording: `drive` and `output` name its channels."""
+    dt, frequency = float(recording.dt), float(recording.frequency())
+    x, y = (np.asarray(recording.channels[c], float) for c in (drive, output))
+    per_period = 1.0 / (frequency * dt)
+    periods = max(1, int(np.floor(len(x) / per_period + 1e-6)))
+    samples = min(len(x), int(round(periods * per_period)))
+    x, y = x[:samples], y[:samples]
+    # phases that close exactly where the samples do
+    divides = abs(periods * per_period - samples) < 1e-3
+    phases = np.arange(samples) * (periods / samples if divides else frequency * dt)
+    count = min(harmonics, int(per_period / 2) - 1)
+    lines, residue = fit_lines(y, phases, count)
+    drive_lines, drive_residue = fit_lines(x, phases, int(min(4 * harmonics, per_period / 2 - 1)))
+    drive_lines, drive_noise = significant_lines(drive_lines, drive_residue, periods)
+    spectrum = np.abs(np.fft.rfft(residue)) ** 2 / samples
+    f = np.fft.rfftfreq(samples, dt)
+    order = f * (1 / frequency)
+    keep = (f > 0) & (np.abs(order - np.round(order)) > 0.5 / periods - 1e-9) if periods > 1 else order > count + 0.5
+    if not divides:
+        keep &= np.abs(order - np.round(order)) > 0.3
+    return Spectrum(
+        recording.name, frequency, periods, samples, dt, drive_lines, lines, f[keep], spectrum[keep], residue,
+        float(np.ptp(y)), drive_noise, (recording.noise or {}).get(output),
+    )  # fmt: skip
+
+
+def significant_lines(lines: np.ndarray, residue: np.ndarray, periods: int):
+    """Drive lines above their noise, others zero; and the rms of the noise.
+
+    The noise of a line is that of the quieter half of all lines: a raw noisy current would feed its noise to the model.
+    """
+    power = np.abs(lines) ** 2
+    floor = np.median(power[len(power) // 2 :]) / np.log(2) if len(power) > 8 else 0.0
+    if periods > 1 and len(residue) > 8:
+        floor = max(floor, np.mean(residue**2) / len(residue))
+    keep = power > 25 * floor + 1e-10 * power[1:].max()
+    keep[:2] = True
+    return np.where(keep, lines, 0.0), float(np.sqrt(floor * len(residue)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """S(f) = white + flicker / f: variance of a sample at each, unit^2 (and unit^2 Hz)."""
+
+    white: float
+    flicker: float
+
+    def density(self, f):
+        """Variance per sample of noise at frequency f (Hz); the mean takes the value of `lowest`."""
+        return self.white + self.flicker / np.maximum(f, 1e-9)
+
+    @property
+    def rms(self) -> float:
+        """White noise, rms."""
+        return float(np.sqrt(self.white))
+
+
+def estimate_noise(spectra, quantum: float = 0.0) -> Noise:
+    """White and flicker noise by Whittle's likelihood over the bins between the harmonics, pooled."""
+    f = np.concatenate([s.between_f for s in spectra])
+    power = np.concatenate([s.between_power for s in spectra])
+    given = [s.given_noise for s in spectra if s.given_noise]
+    if len(f) < 20:
+        white = np.mean(np.square(given)) if given else max(quantum**2 / 12, (1e-4 * spectra[0].peak_to_peak) ** 2)
+        return Noise(float(white), 0.0)
+    white0 = max(np.median(power) / np.log(2), 1e-300)
+    f0 = float(np.median(f))
+
+    def whittle(theta):
+        S = np.exp(theta[0]) + np.exp(theta[1]) * f0 / f
+        r = power / white0
+        return np.mean(np.log(S) + r / S)
+
+    best = minimize(whittle, [0.0, -4.0], method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-7, "maxiter": 400})
+    white, flicker = np.exp(best.x[0]) * white0, np.exp(best.x[1]) * white0 * f0
+    gain = np.mean(np.log(white0 * 1.0) + power / white0) - np.mean(np.log(white + flicker / f) + power / (white + flicker / f))
+    if gain * len(f) < 4:  # the flicker does not earn its place
+        white, flicker = float(np.mean(power)), 0.0
+    return Noise(max(float(white), quantum**2 / 12), float(flicker))
+
+
+def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
+    """Standard deviation of the real (and of the imaginary) part of each reading line, unit; line 0 is real alone."""
+    count = len(spectrum.reading)
+    lowest = spectrum.frequency / max(spectrum.periods, 1)
+    f = np.maximum(np.arange(count) * spectrum.frequency, lowest)
+    variance = noise.density(f) / spectrum.samples
+    return np.sqrt(np.where(np.arange(count) == 0, variance, 0.5 * variance))

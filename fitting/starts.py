@@ -1,0 +1,136 @@
+"""Where a fit starts: the masses by constrained least squares on the equation error (T&B Sec. 2.1).
+
+The measured reading is led back through the sensor and mechanics to M, the drive and dM/dt give H by (4), and M is
+then linear in the masses: nonnegative least squares with the roughness penalties, no simulation.
+"""
+
+import numpy as np
+
+from magjax.constants import MU0
+
+from .spectra import evaluate_lines
+
+
+def everett_rows(basis, alpha, beta) -> np.ndarray:
+    """T(alpha, beta) of every basis function at total mass 1, (points, unknowns)."""
+    L = basis.size
+    cube = basis.cells.reshape(L, L, -1)
+    values = np.zeros((L + 1, L + 1, cube.shape[2]))
+    values[1:, :L] = np.cumsum(np.cumsum(cube, axis=0)[:, ::-1], axis=1)[:, ::-1]
+    k = np.arange(L)
+    diagonal = cube[k, k]
+    values[k, k + 1] = diagonal
+    step = (basis.high - basis.low) / L
+
+    def locate(field):
+        place = np.clip((np.asarray(field) - basis.low) / step, 0, L)
+        cell = np.clip(np.floor(place), 0, L - 1).astype(int)
+        return cell, (place - cell)[:, None]
+
+    (i, p), (j, q) = locate(alpha), locate(beta)
+    flat = (1 - p) * ((1 - q) * values[i, j] + q * values[i, j + 1]) + p * ((1 - q) * values[i + 1, j] + q * values[i + 1, j + 1])
+    return flat - p * (1 - p) * diagonal[i] - q * (1 - q) * diagonal[j]
+
+
+def operator_rows(basis, field: np.ndarray, history=()) -> np.ndarray:
+    """d M / d x at total mass 1 for a field sequence after negative saturation and a history: (time, unknowns).
+
+    M = bottom + rows @ x: the last branch's Everett value on top of that of the reversal it started from.
+    """
+    stack = [(basis.low, 0)]  # extrema with the number of their event
+    events, samples = [], []  # (alpha, beta, sign, parent)
+    events.append((basis.low, basis.low, 0.0, -1))
+    for value in np.concatenate([np.asarray(history, float), field]):
+        tip, number = stack[-1]
+        rising = value >= tip
+        if len(stack) >= 2 and (value - tip) * (tip - stack[-2][0]) >= 0:
+            stack.pop()
+        while len(stack) >= 3 and abs(value - stack[-1][0]) >= abs(stack[-2][0] - stack[-1][0]):
+            del stack[-2:]
+        base, number = stack[-1]
+        alpha, beta, sign = (value, base, 2.0) if value >= base else (base, value, -2.0)
+        events.append((alpha, beta, sign, number))
+        if value != base:
+            stack.append((value, len(events) - 1))
+        samples.append(len(events) - 1)
+        del rising
+    alpha, beta, sign, parent = (np.asarray(c) for c in zip(*events, strict=True))
+    rows = sign[:, None] * everett_rows(basis, alpha, beta)
+    total = np.zeros_like(rows)
+    for k in range(1, len(rows)):
+        total[k] = total[parent[k]] + rows[k]
+    return total[np.asarray(samples)][len(history) :]
+
+
+def inferred_loops(spectra, deviations, actuator, samples: int = 200):
+    """Field and magnetization over a period from the reading, by (4) and (5) backwards: lists of (H, M, trust)."""
+    loops = []
+    phases = np.arange(samples) / samples
+    coil = actuator.coil
+    for s, sigma in zip(spectra, deviations, strict=True):
+        applied = np.asarray(coil.applied_field(s.drive_at(phases)))
+        count = min(len(s.reading), samples // 2 - 1)
+        keep = np.abs(s.reading[:count]) > 4 * sigma[:count]
+        keep[: 3] = True
+        w = 2j * np.pi * s.frequency * np.arange(count)
+        lines = np.where(keep, s.reading[:count], 0.0)
+        if actuator.output == "displacement":
+            lines = lines - np.eye(1, count)[0] * float(actuator.sensor.offset)
+            gain = np.asarray(actuator.mechanics.response(w)) if actuator.mechanics is not None else np.ones(count)
+            lines = np.where(np.abs(gain) > 0.05, lines / gain, 0.0)
+            free = evaluate_lines(lines, phases)
+            scale = float(actuator.magnetostriction.reach)
+            M = float(actuator.magnetostriction.M_s) * unfold(np.sqrt(np.maximum(free, 0.0) / scale), applied)
+            rate = np.gradient(np.concatenate([M[-2:], M, M[:2]]))[2:-2] * samples * s.frequency
+            H = applied - float(coil.loss) * MU0 * rate
+            trust = np.abs(M) / np.abs(M).max()
+        else:
+            B = evaluate_lines(lines, phases)
+            H = applied - float(coil.loss) * evaluate_lines(lines * w, phases)
+            M = (B / MU0 - H) if actuator.output == "flux_density" else B
+            trust = np.ones(samples)
+        loops.append((H, M, trust))
+    return loops
+
+
+def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
+    """The signed M behind |M| over a period: where |M| nearly touches zero it may have changed sign.
+
+    Of the two readings, one sign throughout and a change at every such touch, the one whose M follows the drive's
+    direction is taken; M is positive where the drive is largest.
+    """
+    turns = (root <= np.roll(root, 1)) & (root < np.roll(root, -1)) & (root < 0.2 * root.max())
+    if not 2 <= turns.sum() <= 8:
+        return root
+    sign = np.where(np.cumsum(turns) % 2 == 0, 1.0, -1.0)
+    changed = root * sign * sign[np.argmax(drive)]
+    direction = np.sign(np.roll(drive, -1) - drive)
+
+    def against(M):
+        return -np.minimum((np.roll(M, -1) - M) * direction, 0.0).sum()
+
+    return changed if turns.sum() % 2 == 0 and against(changed) < against(root) else root
+
+
+def equation_error_start(basis, spectra, deviations, actuator, solve, max_frequency=None):
+    """Density unknowns and the bottom of M from the slower half of the recordings: (x, bottom / total)."""
+    order = np.argsort([s.frequency for s in spectra])
+    chosen = order[: max(2, (len(order) + 1) // 2)] if max_frequency is None else order
+    spectra = [spectra[k] for k in chosen]
+    loops = inferred_loops(spectra, [deviations[k] for k in chosen], actuator)
+    rows, values = [], []
+    for H, M, trust in loops:
+        H = np.clip(H, basis.low + (basis.high - basis.low) / basis.size, basis.high)
+        Phi = operator_rows(basis, np.tile(H, 2))[len(H) :]
+        rows.append(np.column_stack([Phi, np.ones(len(H))]) * trust[:, None])
+        values.append(M / basis.total * trust)
+    A, b = np.concatenate(rows), np.concatenate(values)
+    tolerance = 0.01 * np.abs(b).max()
+    A, b = A / tolerance, b / tolerance
+    n = basis.unknowns
+    normal, gradient = A.T @ A, -A.T @ b
+    for weight, D in zip((3.0, 3.0, 30.0), basis.penalties, strict=True):
+        normal[:n, :n] += weight * D.T @ D
+    normal += 1e-8 * np.trace(normal) / len(normal) * np.eye(n + 1)
+    solution = np.asarray(solve(normal, gradient, np.zeros(n + 1), np.arange(n + 1) < n))
+    return np.maximum(solution[:n], 0.0), float(solution[n])
