@@ -5,11 +5,13 @@ With k the loss of the coil, X = H + M and a = mu0 k / h, one step of the second
 and of the trapezoid rule
     a (X1 - X0) + (H1 + H0)/2 = (applied 0 + applied 1)/2,                      p = 1/2 + a,   q = a.
 Both ask for p v + q M(v) = rhs: strictly monotone and piecewise quadratic in the field v. Corners that the step wipes
-out follow from stored values, the cell by bisection over the levels, the rest from a quadratic in closed form; one
+out follow from stored values, the cell by a search over the levels, the rest from a quadratic in closed form; one
 Newton polish with a frozen slope adds nothing to the value and makes every derivative exact.
 The backward formula does not ring where the time constant mu0 k (1 + dM/dH) is far below the step, as at low frequency,
 and turns into M(applied field) for k = 0; the trapezoid has the smaller error constant where the loop is resolved.
 """
+
+import math
 
 import equinox as eqx
 import jax
@@ -78,7 +80,7 @@ def _slope(table, field, threshold, rising):
 
 
 def _locate(table, branch, p, q, rhs):
-    """The solution itself, all inputs frozen: bisection over the levels, then the quadratic of one cell."""
+    """The solution itself, all inputs frozen: a search over the levels, then the quadratic of one cell."""
     rising, _, threshold, m_there = branch
     L, width = table.cells, table.cells + 1
     fixed, share = table.locate(threshold)
@@ -89,18 +91,19 @@ def _locate(table, branch, p, q, rhs):
     constant = p * table.low + q * (m_there - 2 * sign * share * (1 - share) * table.diagonal[fixed]) - rhs
 
     def not_above(level):
-        at = base + level * along
+        at = base + jnp.clip(level, 0, L) * along
         T = (1 - share) * flat[at] + share * flat[at + across]
-        return constant + p * level * table.step + 2 * q * sign * T <= 0
+        value = constant + p * level * table.step + 2 * q * sign * T
+        # rising the branch runs over the levels above the threshold, falling over those below it
+        return jnp.where(rising, (level <= fixed) | ((value <= 0) & (level <= L)), (value <= 0) & (level <= fixed))
 
-    # rising the branch runs over the levels above the threshold, falling over those below it
-    lo, hi = jnp.where(rising, fixed, -1), jnp.where(rising, L, fixed)
-    for _ in range((L + 1).bit_length()):
-        middle = (lo + hi + 1) // 2
-        lower = not_above(jnp.clip(middle, 0, L))
-        go = hi > lo
-        lo, hi = jnp.where(go & lower, middle, lo), jnp.where(go & ~lower, middle - 1, hi)
-    cell = jnp.clip(lo, 0, L - 1)
+    # the last level not above the solution: every m-th level first, then those between. Two counts keep the program
+    # small; a bisection written out makes the compiler duplicate each half into the next
+    m = math.isqrt(L) + 1
+    coarse = jnp.sum(not_above(m * jnp.arange(m + 1))) - 1
+    first = jnp.maximum(coarse, 0) * m
+    within = jnp.sum(not_above(first + jnp.arange(1, m))) + first
+    cell = jnp.clip(jnp.where(coarse < 0, -1, within), 0, L - 1)
 
     # in the cell T = first + (second - first - D) z + D z^2; go from the anchor by the distance rho that is left
     first, second = _level_values(table, cell, fixed, share, rising)

@@ -1,0 +1,167 @@
+"""fit(recordings, bench): the joint fit as users call it, with its gates and its outcome in words."""
+
+import dataclasses
+import time
+
+import jax.numpy as jnp
+import numpy as np
+
+from magjax.bench import load_bench
+from magjax.simulate import require_x64
+
+from .joint import data_residual, solve
+from .result import FitResult, RecordingFit
+from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
+from .spectra import estimate_noise
+from .uncertainty import UNDERSMOOTH, correlations, estimates
+
+FINER_KNOTS = ((26, 18), (36, 24))
+
+
+def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None) -> FitResult:
+    """Fit an actuator to recordings jointly.
+
+    `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
+    of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it; `progress`:
+    called as progress(text, step, chi2 per datum). Returns a `FitResult`; raises `RecordingError` where a recording
+    cannot be used and `ConfigurationError` for a wrong bench. Non-convergence is a result, not an exception.
+    """
+    require_x64()
+    bench = load_bench(bench)
+    actuator = bench.actuator() if actuator is None else actuator
+    begin = time.perf_counter()
+    spectra = spectra_of(recordings, bench, choices.harmonics)
+    noise = estimate_noise(spectra)
+    names = free_parameters(bench, actuator, extra)
+    report = (lambda *a: None) if progress is None else progress
+    problem, z = build_problem(spectra, noise, actuator, bench, names, choices, start)
+    first = solve(problem, z, START_WEIGHTS, max_jacobians=1, evidence=False)
+    warm = time.perf_counter() - begin
+    solution = solve(problem, z, START_WEIGHTS, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
+    del first
+    if refine and choices.knots is not None:
+        problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, noise, report)
+    return finish(problem, solution, actuator, bench, recordings, warm)
+
+
+def _evidence(problem, solution) -> float:
+    """Minus twice the log evidence (Laplace), up to a constant that all density bases share."""
+    z, layout = solution.z, problem.layout
+    n = layout.density_unknowns
+    prior = np.zeros((n, n))
+    for w, D in zip(solution.weights, layout.penalties, strict=True):
+        prior += w * np.asarray(D).T @ np.asarray(D)
+    free = np.append(z[:n] > 0, np.ones(len(z) - n, bool))
+    index = np.flatnonzero(free)
+    _, logdet = np.linalg.slogdet(solution.normal[np.ix_(index, index)])
+    ridge = 1e-6 * np.trace(prior) / n * np.eye(n)
+    inside = index[index < n]
+    _, logprior = np.linalg.slogdet((prior + ridge)[np.ix_(inside, inside)])
+    return 2 * solution.cost + logdet - logprior
+
+
+def _refine_density(problem, solution, actuator, bench, names, choices, spectra, noise, report):
+    """Finer hats where chi2 stays above the noise and they lower it clearly."""
+    count = problem.data_count
+    for knots in FINER_KNOTS:
+        if solution.chi2 / count < 1.05 or not np.isfinite(solution.chi2) or solution.chi2 / count > 400:
+            break
+        finer = dataclasses.replace(choices, knots=knots, level=max(choices.level, 4 * knots[0]))
+        current = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
+        started = _resample(problem, solution, spectra, noise, actuator, bench, names, finer)
+        trial_problem, z = started
+        z = _with_parameters(trial_problem, z, problem, solution)
+        trial = solve(trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("finer density", k, c))
+        del current
+        if not trial.chi2 < solution.chi2 - 30 - 0.02 * count:
+            break
+        problem, solution, choices = trial_problem, trial, finer
+    return problem, solution, choices
+
+
+def _with_parameters(new_problem, z, problem, solution):
+    z = z.copy()
+    for name in problem.layout.names:
+        value = float(problem.layout.value(name, jnp.asarray(solution.z)))
+        z[new_problem.layout.index(name)] = new_problem.layout.coordinate(name, value)
+    return z
+
+
+def _resample(problem, solution, spectra, noise, actuator, bench, names, choices):
+    """A problem on finer hats, started from the fitted parameters and the equation error under them."""
+    values = {n: float(problem.layout.value(n, jnp.asarray(solution.z))) for n in names}
+    return build_problem(spectra, noise, actuator.replace(values), bench, names, choices)
+
+
+def finish(problem, solution, actuator, bench, recordings, warm=0.0) -> FitResult:
+    """Estimates (quoted with a tenth of the roughness weights), per-recording misfit, outcome."""
+    fitted = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
+    count = problem.data_count
+    refined = solution
+    if solution.chi2 / count < 20:
+        refined = solve(problem, solution.z, UNDERSMOOTH * solution.weights, max_jacobians=4, evidence=False)
+    quoted = problem.layout.actuator(problem.template, jnp.asarray(refined.z))
+    rows = estimates(problem, refined, quoted)
+    residual = data_residual(problem, solution.z)
+    per_recording = recording_fits(problem, residual, recordings, bench)
+    n = problem.layout.density_unknowns
+    prior = np.zeros_like(solution.normal)
+    for w, D in zip(solution.weights, problem.layout.penalties, strict=True):
+        prior[:n, :n] += w * np.asarray(D).T @ np.asarray(D)
+    from .uncertainty import covariance
+
+    cov = covariance(solution.normal, solution.z, n)
+    effective = float(np.trace(cov @ (solution.normal - prior)))
+    chi2n = solution.chi2 / count
+    message = outcome(chi2n, per_recording, solution, rows, problem)
+    return FitResult(
+        fitted, bench, bool(solution.converged), message, tuple(rows), correlations(problem, refined), per_recording, float(chi2n), count,
+        effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
+        problem.spectra,
+    )  # fmt: skip
+
+
+def recording_fits(problem, residual, recordings, bench):
+    """Misfit of each recording from the whitened residual vector."""
+    R, H = problem.target.lines.shape
+    real = residual[: R * H].reshape(R, H)
+    imag = residual[R * H :].reshape(R, H - 1)
+    deviations = np.asarray(problem.target.deviations)
+    rows = []
+    for k, (recording, s) in enumerate(zip(recordings, problem.spectra, strict=True)):
+        finite = np.isfinite(deviations[k])
+        number = 2 * finite.sum() - finite[0]
+        chi2 = float((real[k] ** 2).sum() + (imag[k] ** 2).sum())
+        misfit = np.where(finite, deviations[k], 0.0)
+        power = (real[k] * misfit) ** 2
+        power[1:] = 2 * (power[1:] + (imag[k] * misfit[1:]) ** 2)
+        between = float(np.mean(s.residue**2))
+        rows.append(
+            RecordingFit(
+                recording.origin.get("file", recording.name) if "[" not in recording.name else recording.name,
+                recording.origin.get("sha256", ""), bench.output, {"displacement": "m", "flux_density": "T"}.get(bench.output, "A/m"),
+                s.frequency, s.periods, problem.noise.rms, float(np.sqrt(power.sum() + between)), chi2 / number,
+            )
+        )  # fmt: skip
+    return tuple(rows)
+
+
+def outcome(chi2n, rows, solution, parameters, problem) -> str:
+    """What the fit means, with its remedy."""
+    if not solution.converged:
+        return f"stopped after {solution.jacobians} Jacobians before it settled; raise the limit or start nearer (see the bench file)"
+    worst = max(rows, key=lambda r: r.chi2_per_sample)
+    bound = [e.name for e in parameters if e.at_bound]
+    if bound:
+        return f"{', '.join(bound)} sits at its bound; free another parameter or check the bench file"
+    if chi2n < 1.1 and worst.chi2_per_sample < 1.6:
+        return "the recordings are met to their noise; the error bars hold"
+    if chi2n > 2:
+        return (
+            f"the residual is {np.sqrt(chi2n):.1f} times the noise (worst: {worst.frequency:.4g} Hz), so the error bars do not hold and no "
+            "parameter is physical yet; run magjax diagnose on the same files"
+        )
+    return (
+        f"chi2/N = {chi2n:.2f}, a little above the noise; the error bars are too narrow: a rough density, or a weak effect "
+        "(magjax diagnose tells which)"
+    )

@@ -1,0 +1,113 @@
+"""The result of a fit: a value that prints itself as a card and writes itself as JSON."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordingFit:
+    """How one recording was met; rms in the unit of its channel."""
+
+    file: str
+    sha256: str
+    channel: str
+    unit: str
+    frequency: float
+    periods: int
+    noise_rms: float
+    residual_rms: float
+    chi2_per_sample: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FitResult:
+    """A fitted actuator with what is known about it. `chi2_per_sample`: misfit per harmonic over its noise."""
+
+    actuator: object
+    bench: object
+    converged: bool
+    message: str
+    estimates: tuple
+    correlations: dict
+    recordings: tuple[RecordingFit, ...]
+    chi2_per_sample: float
+    data_count: int
+    unknowns: float
+    bic: float
+    jacobians: int
+    compile_s: float
+    solve_s: float
+    problem: object = dataclasses.field(repr=False, default=None)
+    solution: object = dataclasses.field(repr=False, default=None)
+    refined: object = dataclasses.field(repr=False, default=None)
+    spectra: tuple = dataclasses.field(repr=False, default=())
+
+    def estimate(self, name: str):
+        """The estimate of one parameter by name."""
+        return next(e for e in self.estimates if e.name == name)
+
+    def __str__(self):
+        lines = [f"{'converged' if self.converged else 'NOT CONVERGED'}: {self.message}", ""]
+        lines += [f"  {e}" for e in self.estimates if e.free]
+        lines += ["", f"  {'recording':30s} {'f / Hz':>8s} {'noise':>10s} {'residual':>10s} {'chi2/N':>8s}"]
+        for r in self.recordings:
+            lines.append(f"  {Path(r.file).name[:30]:30s} {r.frequency:8.4g} {r.noise_rms:10.3g} {r.residual_rms:10.3g} {r.chi2_per_sample:8.3g}")
+        lines.append("")
+        lines.append(
+            f"  chi2/N = {self.chi2_per_sample:.3g} over {self.data_count} numbers, about {self.unknowns:.0f} effective unknowns, "
+            f"{self.jacobians} Jacobians in {self.solve_s:.2f} s"
+        )
+        return "\n".join(lines)
+
+    def as_dict(self) -> dict:
+        """The content of fit.json."""
+        return {
+            "converged": bool(self.converged),
+            "message": self.message,
+            "bench": self.bench.name,
+            "recordings": [dataclasses.asdict(r) for r in self.recordings],
+            "parameters": {
+                e.name: {
+                    "value": e.value, "stderr": e.stderr, "unit": e.unit, "free": e.free, "start": e.start,
+                    "at_bound": e.at_bound, "identified": e.identified,
+                }
+                for e in self.estimates
+            },
+            "correlations": self.correlations,
+            "levels": int(self.actuator.hysteresis.cells),
+            "chi2_per_sample": self.chi2_per_sample,
+            "bic": self.bic,
+            "jacobians": self.jacobians,
+            "compile_s": self.compile_s,
+            "solve_s": self.solve_s,
+        }  # fmt: skip
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def model_as_dict(actuator, bench) -> dict:
+    """Everything that simulates the actuator again, bit for bit."""
+    hysteresis = actuator.hysteresis
+    return {
+        "bench": {**dataclasses.asdict(bench)},
+        "output": actuator.output,
+        "parameters": {n: float(np.asarray(v)) for n, (v, _) in actuator.parameters().items()},
+        "effects": [e.name for e in actuator.effects],
+        "hysteresis": {
+            "low": float(hysteresis.low), "high": float(hysteresis.high), "offset": float(hysteresis.offset),
+            "history": np.asarray(hysteresis.history).tolist(), "masses": np.asarray(hysteresis.masses).tolist(),
+        },
+    }  # fmt: skip
+
+
+def write_model(folder: Path, actuator, bench) -> None:
+    """model.json in a folder."""
+    write_atomically(folder / "model.json", json.dumps(model_as_dict(actuator, bench)))

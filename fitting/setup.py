@@ -1,0 +1,126 @@
+"""From recordings and a bench to a `Problem`: spectra, noise, the plane, the density basis, the start."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from magjax.errors import ConfigurationError, RecordingError
+from magjax.param import parameters_of
+from magjax.preisach.memory import nesting
+
+from .density import cell_basis, hat_basis
+from .joint import Problem
+from .model import Layout, Predictor, Target, make_start_actuator
+from .solver import bounded_step
+from .spectra import HARMONICS, estimate_noise, line_deviations, reduce_recording
+from .starts import equation_error_start
+
+START_WEIGHTS = (1e2, 1e2, 1e2)
+PLANE_MARGIN = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class Choices:
+    """How a fit is set up. `level`: cells along the plane; `knots`: hats in s and r, None for one unknown a cell;
+    `coarse`, `fine`: samples a period for the Jacobian and for the residual; `periods`: simulated, the last used."""
+
+    level: int = 80
+    knots: tuple[int, int] | None = (18, 13)
+    coarse: int = 125
+    fine: int = 500
+    periods: int = 3
+    harmonics: int = HARMONICS
+    max_jacobians: int = 40
+    sensor_offset: bool = False
+
+
+def spectra_of(recordings, bench, harmonics: int = HARMONICS):
+    """Each recording reduced to lines; raises `RecordingError` where one is not periodic."""
+    spectra = []
+    for recording in recordings:
+        if recording.frequency() is None:
+            raise RecordingError(
+                f"{recording.name}: the {recording.drive} does not repeat; a fit needs periodic drives (one whole period at least), "
+                "give this recording with --check instead"
+            )
+        spectra.append(reduce_recording(recording, bench.drive, bench.output, harmonics))
+    return tuple(spectra)
+
+
+def applied_range(spectra, actuator):
+    """Lowest and highest applied field over all recordings, A/m."""
+    phases = np.arange(500) / 500
+    fields = [np.asarray(actuator.coil.applied_field(s.drive_at(phases))) for s in spectra]
+    return min(f.min() for f in fields), max(f.max() for f in fields)
+
+
+def free_parameters(bench, actuator, extra=()):
+    """Names of the scalar parameters to fit: the bench's, and those of the effects."""
+    known = actuator.parameters()
+    names = [n for n in bench.free if n != "hysteresis.masses"] + list(extra)
+    for name in names:
+        if name not in known:
+            raise ConfigurationError(f'fit.free names "{name}", which this bench does not have; it has {", ".join(known)}')
+    return tuple(dict.fromkeys(names))
+
+
+def effect_parameters(effect, actuator):
+    """Full names of an effect's parameters that a fit frees."""
+    return tuple(f"effects.{effect.name}.{p}" for p in parameters_of(effect))
+
+
+def build_problem(spectra, noise, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
+    """The problem and its starting vector. `start`: density unknowns and bottom to reuse, else equation error."""
+    low, high = applied_range(spectra, actuator)
+    margin = PLANE_MARGIN * (high - low)
+    total = float(actuator.magnetostriction.M_s) if actuator.magnetostriction is not None else _total_from(spectra, bench)
+    if choices.knots is None:
+        basis = cell_basis(low - margin, high + margin, total, choices.level)
+    else:
+        basis = hat_basis(low - margin, high + margin, total, choices.level, *choices.knots)
+    harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
+    deviations = [line_deviations(s, noise)[: harmonics + 1] for s in spectra]
+    if start is None:
+        full = [line_deviations(s, noise) for s in spectra]
+        x, bottom = equation_error_start(basis, spectra, full, actuator, jax.jit(bounded_step))
+        start = np.append(x, bottom)
+    known = actuator.parameters()
+    values = [float(known[n][0]) for n in names]
+    infos = [known[n][1] for n in names]
+    log = [i.low >= 0 and v > 0 and (i.null is None or i.shape) for i, v in zip(infos, values, strict=True)]
+    scales = [i.scale for i in infos]
+    layout = Layout.build(basis, names, values, scales, log)
+    corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
+    corners = int(4 * np.ceil(corners / 4))
+    predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in (choices.coarse, choices.fine))
+    lines = np.stack([s.reading[: harmonics + 1] for s in spectra])
+    deviations = np.stack(deviations)
+    if actuator.output == "flux_density":  # an integrated emf has no mean
+        deviations[:, 0] = np.inf
+    priors = np.asarray([_prior(bench, n, v, is_log) for n, v, is_log in zip(names, values, log, strict=True)])
+    target = Target(jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS), jnp.asarray(priors), jnp.asarray(1e-3))
+    problem = Problem(layout, make_start_actuator(actuator, basis), predictors, target, tuple(spectra), noise)
+    return problem, np.concatenate([start, np.zeros(len(names))])
+
+
+def _prior(bench, name, value, is_log):
+    """1 / standard deviation in the optimiser's coordinate: the bench's, or a very wide one that keeps it finite."""
+    if name in bench.priors:
+        deviation = bench.priors[name]
+        return value / deviation if is_log else 1.0 / deviation
+    return 1e-2
+
+
+def _total_from(spectra, bench):
+    """Scale of the masses where no M_s is stated: from the largest reading."""
+    largest = max(s.peak_to_peak for s in spectra)
+    return largest / (4e-7 * np.pi) if bench.output == "flux_density" else largest
+
+
+def prepare(recordings, bench, actuator, names, choices: Choices = Choices()):
+    """Spectra, noise, problem and start in one call."""
+    spectra = spectra_of(recordings, bench, choices.harmonics)
+    noise = estimate_noise(spectra)
+    return build_problem(spectra, noise, actuator, bench, names, choices)

@@ -1,0 +1,85 @@
+"""What a fit knows: standard errors, correlations, what is not identified, what sits at a bound, the outcome in words."""
+
+import dataclasses
+
+import numpy as np
+
+WIDEN = 1.3  # stated errors are widened by this: the evidence weights take the roughness for granted
+UNDERSMOOTH = 0.1  # parameters are quoted with a tenth of the roughness weights
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """One parameter: `value` and `stderr` in SI."""
+
+    name: str
+    value: float
+    stderr: float
+    unit: str
+    meaning: str
+    free: bool
+    start: float
+    at_bound: bool = False
+    identified: bool = True
+
+    def __str__(self):
+        if not self.free:
+            return f"{self.name:32s} {self.value:12.6g}              {self.unit:10s} fixed"
+        flags = (" AT BOUND" if self.at_bound else "") + ("" if self.identified else " NOT IDENTIFIED")
+        return f"{self.name:32s} {self.value:12.6g} ± {self.stderr:<9.2g} {self.unit:10s} (start {self.start:.4g}){flags}"
+
+
+def covariance(normal: np.ndarray, z: np.ndarray, density_unknowns: int) -> np.ndarray:
+    """Inverse normal matrix on the unknowns that are not at their bound; zero elsewhere."""
+    free = np.append(z[:density_unknowns] > 0, np.ones(len(z) - density_unknowns, bool))
+    index = np.flatnonzero(free)
+    part = normal[np.ix_(index, index)]
+    scale = 1 / np.sqrt(np.maximum(np.diag(part), 1e-300))
+    inverse = np.linalg.inv(part * scale[:, None] * scale + 1e-11 * np.eye(len(index)))
+    result = np.zeros_like(normal)
+    result[np.ix_(index, index)] = inverse * scale[:, None] * scale
+    return result
+
+
+def estimates(problem, solution, actuator) -> list[Estimate]:
+    """Every declared parameter of the fitted actuator with its error."""
+    layout = problem.layout
+    cov = covariance(solution.normal, solution.z, layout.density_unknowns)
+    rows = []
+    for name, (value, info) in actuator.parameters().items():
+        value = float(np.asarray(value))
+        if name in layout.names:
+            index = layout.index(name)
+            slope = layout.slope(name, solution.z)
+            stderr = WIDEN * abs(slope) * float(np.sqrt(max(cov[index, index], 0.0)))
+            reach = max(abs(value), info.scale)
+            at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach)
+            start = float(layout.starts[layout.names.index(name)])
+            rows.append(Estimate(name, value, stderr, info.unit, info.meaning, True, start, at_bound, bool(stderr < 0.5 * reach)))
+        else:
+            rows.append(Estimate(name, value, 0.0, info.unit, info.meaning, False, value))
+    return rows
+
+
+def correlations(problem, solution) -> dict:
+    """Correlation of each pair of free physical parameters: "a~b" -> coefficient."""
+    layout = problem.layout
+    cov = covariance(solution.normal, solution.z, layout.density_unknowns)
+    found = {}
+    for i, a in enumerate(layout.names):
+        for b in layout.names[i + 1 :]:
+            ia, ib = layout.index(a), layout.index(b)
+            spread = np.sqrt(cov[ia, ia] * cov[ib, ib])
+            found[f"{a}~{b}"] = float(cov[ia, ib] / spread) if spread > 0 else 0.0
+    return found
+
+
+def visited_cells(actuator, spectra) -> np.ndarray:
+    """Which cells of the plane some recording switches: alpha below its highest field and beta above its lowest."""
+    levels = np.asarray(actuator.hysteresis.levels)
+    seen = np.zeros((len(levels) - 1,) * 2, bool)
+    phases = np.arange(400) / 400
+    for s in spectra:
+        applied = np.asarray(actuator.coil.applied_field(s.drive_at(phases)))
+        seen |= (levels[:-1, None] < applied.max()) & (levels[None, 1:] > applied.min())
+    return np.tril(seen)

@@ -1,0 +1,37 @@
+"""Read a fitted actuator back from model.json, bit for bit."""
+
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .bench import Bench
+from .errors import ConfigurationError
+from .preisach import Preisach
+
+
+def load_model(folder):
+    """(actuator, bench) from a result folder or its model.json."""
+    from .effects import CATALOGUE
+
+    path = Path(folder)
+    path = path / "model.json" if path.is_dir() else path
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"{path}: not a fitted model ({error}); give the folder that magjax fit wrote") from None
+    stated = dict(content["bench"])
+    for key in ("blocks", "free"):
+        stated[key] = tuple(stated[key])
+    bench = Bench(**stated)
+    actuator = bench.actuator()
+    plane = content["hysteresis"]
+    hysteresis = Preisach(np.asarray(plane["masses"]), plane["low"], plane["high"], plane["offset"])
+    hysteresis = eqx.tree_at(lambda h: h.history, hysteresis, jnp.asarray(plane["history"], dtype=float))
+    actuator = eqx.tree_at(lambda a: a.hysteresis, actuator, hysteresis)
+    classes = {e.name: e for e in CATALOGUE}
+    for name in content["effects"]:
+        actuator = actuator.with_effect(classes[name]())
+    return actuator.replace(content["parameters"]), bench

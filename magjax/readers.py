@@ -1,0 +1,280 @@
+"""Files into recordings: CSV, NetCDF, MATLAB, acquisition logs; units, column maps, an emf into flux density."""
+
+import hashlib
+import re
+from pathlib import Path
+
+import numpy as np
+
+from .bench import load_bench
+from .errors import ConfigurationError, MagjaxError, RecordingError
+from .recording import Recording, fundamental
+
+UNITS = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
+    "current": {"A": 1.0, "mA": 1e-3},
+    "field": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3, "Oe": 1e3 / (4 * np.pi)},
+    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
+    "flux_density": {"T": 1.0, "mT": 1e-3, "G": 1e-4},
+    "magnetization": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3},
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "temperature": {"degC": 1.0, "K": 1.0},
+}
+# what no bench of this kind exceeds: (largest sensible absolute value, usual wrong unit)
+SENSIBLE = {"current": (60.0, "mA"), "displacement": (5e-3, "um"), "flux_density": (4.0, "mT"), "field": (5e6, "Oe")}
+
+
+def load_recordings(paths, bench) -> list[Recording]:
+    """Recordings of one or several files, SI, as the bench names their columns.
+
+    Raises `RecordingError` naming file, column and mend.
+    """
+    bench = load_bench(bench)
+    paths = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    if not paths:
+        raise ConfigurationError("no recording given; name one or several files")
+    recordings = []
+    for path in paths:
+        recordings += read_file(Path(path), bench)
+    return recordings
+
+
+def read_file(path: Path, bench) -> list[Recording]:
+    """All recordings in one file."""
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file; check the name")
+    if path.is_dir():
+        raise RecordingError(f"{path}: is a folder; name its files (for instance {path}/*.csv)")
+    if path.stat().st_size == 0:
+        raise RecordingError(f"{path}: the file is empty; record again")
+    suffix = path.suffix.lower()
+    reader = {".nc": _read_netcdf, ".mat": _read_mat, ".mjlog": _read_log}.get(suffix, _read_csv)
+    try:
+        table, metadata = reader(path)
+    except MagjaxError:
+        raise
+    except (OSError, ValueError, KeyError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: cannot be read as {suffix[1:] or 'CSV'} ({error})") from None
+    origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "metadata": metadata}
+    return _recordings(path, table, origin, bench)
+
+
+def _read_csv(path):
+    metadata, skip = {}, 0
+    with open(path, encoding="utf-8-sig") as stream:
+        for line in stream:
+            if not line.strip():
+                skip += 1
+                continue
+            if not line.startswith("#"):
+                header = line
+                break
+            key, _, value = line[1:].partition(":")
+            metadata[key.strip()] = value.strip()
+            skip += 1
+        else:
+            raise RecordingError(f"{path}: holds no header row; the first row must name the columns")
+    separator = next((s for s in (",", ";", "\t") if s in header), ",")
+    names = [n.strip().strip('"') for n in header.split(separator)]
+    try:
+        values = np.genfromtxt(path, delimiter=separator, skip_header=skip + 1, ndmin=2, comments="#", encoding="utf-8-sig")
+    except ValueError as error:
+        raise RecordingError(f"{path}: rows of unequal length ({str(error).splitlines()[-1].strip()}); mend or cut them") from None
+    if values.size == 0:
+        raise RecordingError(f"{path}: has a header but no samples; record again")
+    if values.shape[1] != len(names):
+        raise RecordingError(f"{path}: {len(names)} column names but {values.shape[1]} columns; mend the header row")
+    return dict(zip(names, values.T, strict=True)), metadata
+
+
+def _read_netcdf(path):
+    import xarray as xr
+
+    with xr.open_dataset(path, engine="h5netcdf") as data:
+        table = {}
+        for name in [*data.coords, *data.data_vars]:
+            unit = data[name].attrs.get("units", "")
+            key = name if _parse(name)[0] and _parse(name)[1] else f"{name}_{unit}".replace("/", "_per_").rstrip("_")
+            table[key] = np.asarray(data[name].values, float)
+        return table, {k: v for k, v in data.attrs.items()}
+
+
+def _read_mat(path):
+    try:
+        from scipy.io import loadmat
+
+        content = loadmat(path, squeeze_me=True)
+    except NotImplementedError:
+        import h5py
+
+        with h5py.File(path) as file:
+            content = {k: np.asarray(v).ravel() for k, v in file.items() if hasattr(v, "shape")}
+    table = {k: np.asarray(v, float).ravel() for k, v in content.items() if not k.startswith("__") and np.ndim(v) == 1}
+    return table, {}
+
+
+def _read_log(path):
+    from .acquire.log import read_log
+
+    time, channels, header, _ = read_log(path)
+    return {"time_s": time, **channels}, dict(header)
+
+
+def _parse(name):
+    """(quantity, unit) of a column name such as displacement_um; (None, None) where it is none."""
+    for quantity, units in UNITS.items():
+        match = re.fullmatch(rf"{quantity}(?:_(.+))?", name)
+        if match:
+            unit = match.group(1)
+            if unit is None or unit in units:
+                return quantity, unit
+    return None, None
+
+
+def _recordings(path, table, origin, bench) -> list[Recording]:
+    split = bench.columns.get("time", {}).get("split")
+    columns, available = {}, list(table)
+    quantities = {bench.drive, bench.output, *[q for q in bench.columns if q != "time"]}
+    for quantity in ("time", "voltage", "temperature", "magnetization", "flux_density", "displacement", "current", "field"):
+        column = bench.columns.get(quantity, {})
+        found = _find(path, table, quantity, column, required=quantity in (bench.drive, bench.output))
+        if found is not None:
+            columns[quantity] = found
+    if not bench.columns.get("time", {}).get("quasistatic") and "time" not in columns:
+        raise RecordingError(f"{path}: no time column among {', '.join(available)}; name one time_s or map it in [columns.time]")
+    del quantities
+    if split is not None:
+        if split not in table:
+            raise RecordingError(f"{path}: no column {split} to split at; the file has {', '.join(available)}")
+        labels = list(dict.fromkeys(table[split]))
+        parts = [(f"{path.name}[{split}={label:g}]", table[split] == label) for label in labels]
+    else:
+        parts = [(path.name, np.ones(len(next(iter(table.values()))), bool))]
+    return [_one(name, {q: v[rows] for q, v in columns.items()}, origin, bench) for name, rows in parts]
+
+
+def _find(path, table, quantity, column, required):
+    if "name" in column:
+        if column["name"] not in table:
+            if not required:
+                return None
+            raise RecordingError(f"{path}: no column {column['name']}; the file has {', '.join(table)} (see [columns.{quantity}])")
+        values, unit = table[column["name"]], column.get("unit")
+    else:
+        matches = [n for n in table if _parse(n)[0] == quantity]
+        if not matches:
+            if required:
+                usual = {"current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m"}.get(quantity, "flux_density_T")
+                raise RecordingError(
+                    f"{path}: no {quantity} column among {', '.join(table)}; name it {usual} or map it in [columns.{quantity}] of the bench"
+                )
+            return None
+        values, unit = table[matches[0]], _parse(matches[0])[1]
+    factor = 1.0
+    if unit is not None and "emf_turns" not in column:
+        if unit not in UNITS[quantity]:
+            raise ConfigurationError(f'columns.{quantity}.unit = "{unit}" is unknown; write one of {", ".join(UNITS[quantity])}')
+        factor = UNITS[quantity][unit]
+    return (np.asarray(values, float) * float(column.get("scale", 1.0)) + float(column.get("offset", 0.0))) * factor
+
+
+def _one(name, columns, origin, bench) -> Recording:
+    quasistatic = bench.columns.get("time", {}).get("quasistatic")
+    count = len(columns[bench.drive])
+    metadata = dict(origin["metadata"])
+    if quasistatic:
+        columns = _uniform_loop({**columns}, bench)
+        count = len(columns[bench.drive])
+        time = np.arange(count) / count
+        metadata["frequency_Hz"] = 1.0
+    else:
+        time = columns["time"] - columns["time"][0]
+    channels = {q: v for q, v in columns.items() if q != "time"}
+    for quantity, (largest, wrong) in SENSIBLE.items():
+        if quantity in channels and np.nanmax(np.abs(channels[quantity])) > largest:
+            raise RecordingError(
+                f"{name}: {quantity} reaches {np.nanmax(np.abs(channels[quantity])):.4g} {_si(quantity)}, more than any such bench gives; "
+                f'if the column is in {wrong}, name it {quantity}_{wrong} or write unit = "{wrong}" in [columns.{quantity}]'
+            )
+    column = bench.columns.get(bench.output, {})
+    if "emf_turns" in column:
+        dt = float(np.median(np.diff(time)))
+        channels[bench.output] = integrate_emf(channels[bench.output], channels[bench.drive], dt, column)
+    metadata = {k: _number(v) for k, v in metadata.items()}
+    recording = Recording(time, channels, {}, {**origin, "metadata": metadata}, name)
+    _check_size(recording, bench)
+    return recording
+
+
+def _si(quantity):
+    return next(iter(UNITS[quantity]))
+
+
+def _number(value):
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return value
+
+
+def _check_size(recording, bench):
+    """Wrong units that are sensible in themselves: far beyond, or far below, what the bench file says."""
+    limit = bench.limits.get("current_A")
+    if limit and "current" in recording.channels:
+        peak = float(np.max(np.abs(recording.channels["current"])))
+        if peak > 20 * limit:
+            raise RecordingError(
+                f"{recording.name}: the current reaches {peak:.4g} A where the bench allows {limit:g} A; "
+                "if the column is in mA, name it current_mA"
+            )
+    reach = bench.constants.get("magnetostriction.lambda_s", 0) * bench.constants.get("magnetostriction.l_rod", 0)
+    if reach and "displacement" in recording.channels:
+        stroke = float(np.ptp(recording.channels["displacement"]))
+        if stroke > 30 * reach or stroke < 1e-5 * reach:
+            raise RecordingError(
+                f"{recording.name}: a stroke of {stroke:.4g} m where the rod gives {reach:.3g} m at saturation; "
+                "if the column is in um, name it displacement_um"
+            )
+
+
+def _uniform_loop(columns, bench):
+    """A quasi-static loop given as points: closed, and resampled evenly along its length in (drive, output)."""
+    x, y = columns[bench.drive], columns[bench.output]
+    bad = ~(np.isfinite(x) & np.isfinite(y))
+    if bad.any():
+        raise RecordingError(f"a loop has a NaN at point {int(np.argmax(bad))}; remove that point")
+    ahead = np.concatenate([[0], np.cumsum(np.abs(np.diff(x)))])
+    # points that stand still in the drive carry no new information for a rate-independent loop
+    keep = np.concatenate([[True], np.diff(ahead) > 0])
+    ahead, x, y = ahead[keep], x[keep], y[keep]
+    closing = abs(x[0] - x[-1])
+    total = ahead[-1] + closing if closing > 1e-6 * np.ptp(x) else ahead[-1]
+    if closing > 1e-6 * np.ptp(x):
+        ahead, x, y = np.append(ahead, total), np.append(x, x[0]), np.append(y, y[0])
+    # even steps of phase of a sine between the extremes put points where the loop bends
+    n = 512
+    top, bottom = x.max(), x.min()
+    phase = 2 * np.pi * np.arange(n) / n
+    drive = 0.5 * (top + bottom) + 0.5 * (top - bottom) * np.cos(phase)
+    travelled = np.concatenate([[0], np.cumsum(np.abs(np.diff(drive)))])
+    start = ahead[np.argmax(x)]
+    place = (start + travelled * (total / (2 * (top - bottom)))) % total
+    return {bench.drive: np.interp(place, ahead, x), bench.output: np.interp(place, ahead, y)}
+
+
+def integrate_emf(emf, drive, dt, column):
+    """Flux density from a pick-up coil's emf = -N A dB/dt (sign from the bench), T.
+
+    The offset is the mean over whole periods; what is integrated has no mean, so B has no drift; B has zero mean.
+    """
+    f = fundamental(np.asarray(drive, float), dt)
+    rate = float(column.get("emf_sign", -1)) * np.asarray(emf, float) / (float(column["emf_turns"]) * float(column["emf_area"]))
+    n = len(rate)
+    whole = n if f is None else int(round(max(1, np.floor(n * dt * f + 1e-6)) / (f * dt)))
+    whole = min(whole, n)
+    rate = rate - rate[:whole].mean()
+    B = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * dt)])
+    # what the ends of the whole periods differ by is drift
+    last = min(whole, n - 1)
+    B = B - (B[last] - B[0]) / (last * dt) * dt * np.arange(n) if f is not None and last > 0 else B
+    return B - B[:whole].mean()
