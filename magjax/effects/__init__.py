@@ -1,0 +1,64 @@
+"""The catalogue of physics that T&B leave out: one file each. Adding an effect is one new file and one line here."""
+
+from .accommodation import Accommodation
+from .amplifier_clipping import AmplifierClipping
+from .amplifier_lag import AmplifierLag
+from .backlash import Backlash
+from .base import AbstractEffect, Trial
+from .coulomb_friction import CoulombFriction
+from .creep import Creep
+from .delta_e import DeltaE
+from .duffing_stiffness import DuffingStiffness
+from .excess_loss import ExcessLoss
+from .field_diffusion import FieldDiffusion
+from .inductive_crosstalk import InductiveCrosstalk
+from .linear_strain import LinearStrain
+from .magnetic_aftereffect import MagneticAftereffect
+from .mains_hum import MainsHum
+from .mean_field import MeanField
+from .quartic_magnetostriction import QuarticMagnetostriction
+from .rate_dependent_switching import RateDependentSwitching
+from .reversible_magnetization import ReversibleMagnetization
+from .second_eddy_path import SecondEddyPath
+from .second_mode import SecondMode
+from .sensor_lag import SensorLag
+from .sensor_nonlinearity import SensorNonlinearity
+from .strain_hysteresis import StrainHysteresis
+from .stress_feedback import StressFeedback
+from .structural_damping import StructuralDamping
+from .thermal_drift import ThermalDrift
+from .transport_delay import TransportDelay
+from .zero_drift import ZeroDrift
+
+CATALOGUE = (
+    AmplifierLag,
+    AmplifierClipping,
+    ExcessLoss,
+    FieldDiffusion,
+    SecondEddyPath,
+    MeanField,
+    ReversibleMagnetization,
+    StressFeedback,
+    MagneticAftereffect,
+    Accommodation,
+    RateDependentSwitching,
+    QuarticMagnetostriction,
+    LinearStrain,
+    StrainHysteresis,
+    SecondMode,
+    DuffingStiffness,
+    DeltaE,
+    CoulombFriction,
+    StructuralDamping,
+    Backlash,
+    Creep,
+    ThermalDrift,
+    SensorLag,
+    TransportDelay,
+    SensorNonlinearity,
+    InductiveCrosstalk,
+    MainsHum,
+    ZeroDrift,
+)
+
+__all__ = ["CATALOGUE", "AbstractEffect", "Trial"]

@@ -1,0 +1,25 @@
+"""mechanics: Young's modulus depends on the magnetization (Delta-E effect)."""
+
+from jaxtyping import Array, Float
+
+from ..param import param
+from .base import AbstractEffect
+from .forces import with_force
+
+
+class DeltaE(AbstractEffect):
+    """Relative stiffness 1 + e (m^2 - mean m^2): the resonance moves with M."""
+
+    e: Float[Array, ""] = param(0.0, "1", "relative change of stiffness from m = 0 to saturation", scale=0.1, null=0.0, typical=(-0.5, 1.0))
+
+    name = "delta_e"
+    block = "mechanics"
+    law = "w0^2 -> w0^2 (1 + e m^2) on the dynamic part of y"
+    source = "A. E. Clark, H. T. Savage, IEEE Trans. Sonics Ultrason. 22 (1975) 50 (giant Delta-E of Terfenol)"
+    signature = "phase and gain near the resonance change with bias; rate-dependent distortion"
+    amplitude = "e"
+
+    def displacement(self, displacement, free_displacement, signals, line, actuator):
+        """Displacement with a stiffness that follows m^2, m."""
+        square = (signals["magnetization"] / actuator.magnetostriction.M_s) ** 2
+        return with_force(displacement, lambda y: -self.e * square * (y - free_displacement), line, actuator)

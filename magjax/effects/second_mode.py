@@ -1,0 +1,31 @@
+"""mechanics: a second mode of the structure beside the first."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..param import param
+from .base import AbstractEffect
+
+
+class SecondMode(AbstractEffect):
+    """A further second-order mode in parallel, driven by the same force."""
+
+    gain: Float[Array, ""] = param(0.0, "1", "static share of the second mode", scale=0.05, null=0.0, typical=(-0.5, 0.5))
+    f2: Float[Array, ""] = param(1200.0, "Hz", "its frequency", low=0.0, scale=1200.0, shape=True, typical=(100.0, 5000.0))
+    xi2: Float[Array, ""] = param(0.05, "1", "its damping ratio", low=0.0, scale=0.05, shape=True, typical=(0.005, 0.3))
+
+    name = "second_mode"
+    block = "mechanics"
+    law = "Y = (G(s) + gain G2(s)) U, G2 of f2, xi2, less its static part"
+    source = "modal superposition (D. J. Ewins, Modal Testing, 2000)"
+    signature = "linear in the forcing: a resonance in the harmonics near f2, whichever drive makes them"
+    amplitude = "gain"
+
+    def displacement(self, displacement, free_displacement, signals, line, actuator):
+        """Displacement with the second mode, m."""
+        w2 = 2 * jnp.pi * self.f2
+
+        def response(s):
+            return w2**2 / (s * s + 2 * self.xi2 * w2 * s + w2**2) - 1
+
+        return displacement + self.gain * line.filter(free_displacement, response)

@@ -1,0 +1,26 @@
+"""sensor: its characteristic is not straight."""
+
+from jaxtyping import Array, Float
+
+from ..param import param
+from .base import AbstractEffect
+
+
+class SensorNonlinearity(AbstractEffect):
+    """Quadratic and cubic departure from a straight line over the range of the sensor."""
+
+    q2: Float[Array, ""] = param(0.0, "1", "quadratic departure at full range", scale=0.01, null=0.0, typical=(-0.1, 0.1))
+    q3: Float[Array, ""] = param(0.0, "1", "cubic departure at full range", scale=0.01, shape=True, typical=(-0.1, 0.1))
+
+    name = "sensor_nonlinearity"
+    block = "sensor"
+    law = "reading = y + l (q2 (y/l)^2 + q3 (y/l)^3), l = saturation displacement"
+    source = "linearity error of LVDTs, as in their data sheets"
+    signature = "distortion that is a function of y alone at every frequency; a free density absorbs it at low frequency"
+    amplitude = "q2"
+
+    def reading(self, reading, signals, line, actuator):
+        """Reading through the curve."""
+        reach = actuator.magnetostriction.reach if actuator.magnetostriction is not None else 1.0
+        part = reading / reach
+        return reading + reach * part * part * (self.q2 + self.q3 * part)

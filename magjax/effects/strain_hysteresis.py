@@ -1,0 +1,37 @@
+"""magnetostriction: the strain lags behind M^2 on its own, rate-independently."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..param import param
+from .base import AbstractEffect
+
+PLAYS = (0.01, 0.03, 0.06, 0.1)  # half-widths relative to saturation strain
+
+
+class StrainHysteresis(AbstractEffect):
+    """A few play operators on the free displacement: u + h sum_i (play_i(u) - u)/n."""
+
+    share: Float[Array, ""] = param(0.0, "1", "share of the strain that lags", scale=0.1, null=0.0, typical=(0.01, 0.5))
+
+    name = "strain_hysteresis"
+    block = "magnetostriction"
+    law = "u -> u + h mean_i(play_ri(u) - u), r = 1, 3, 6, 10 % of saturation strain"
+    source = "hysteresis of lambda against M^2 in Terfenol-D (M. Moffett et al., J. Acoust. Soc. Am. 89 (1991) 1448)"
+    signature = "a lag of y that does not depend on frequency and is absent in M"
+    amplitude = "share"
+
+    def strain(self, free_displacement, magnetization, field, line, actuator):
+        """Free displacement with plays, m."""
+        widths = jnp.asarray(PLAYS) * actuator.magnetostriction.reach
+
+        def follow(state, u):
+            state = jnp.clip(state, u - widths, u + widths)
+            return state, jnp.mean(state)
+
+        start = jnp.broadcast_to(free_displacement[0], widths.shape)
+        if line.periodic:
+            start, _ = jax.lax.scan(follow, start, free_displacement)
+        _, late = jax.lax.scan(follow, start, free_displacement)
+        return free_displacement + self.share * (late - free_displacement)
