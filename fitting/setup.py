@@ -99,17 +99,19 @@ def build_problem(spectra, noise, actuator, bench, names, choices: Choices, star
     deviations = np.stack(deviations)
     if actuator.output == "flux_density":  # an integrated emf has no mean
         deviations[:, 0] = np.inf
-    priors = np.asarray([_prior(bench, n, v, is_log) for n, v, is_log in zip(names, values, log, strict=True)])
+    priors = np.asarray([_prior(bench, *row) for row in zip(names, values, log, infos, strict=True)])
     target = Target(jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS), jnp.asarray(priors), jnp.asarray(1e-3))
     problem = Problem(layout, make_start_actuator(actuator, basis), predictors, target, tuple(spectra), noise)
     return problem, np.concatenate([start, np.zeros(len(names))])
 
 
-def _prior(bench, name, value, is_log):
+def _prior(bench, name, value, is_log, info):
     """1 / standard deviation in the optimiser's coordinate: the bench's, or a very wide one that keeps it finite."""
     if name in bench.priors:
         deviation = bench.priors[name]
         return value / deviation if is_log else 1.0 / deviation
+    if info.shape:  # a shape means nothing while its effect is small: hold it within about a factor of three
+        return 1.0 if is_log else 0.5
     return 1e-2
 
 

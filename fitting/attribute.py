@@ -1,0 +1,97 @@
+"""Attribution: the leaders of the screening are fitted for real, from scratch, and must earn their place.
+
+A candidate is credited with what it gains beyond the base fitted again from the same start (the placebo), must explain
+its share of the excess misfit, and must have a physical sign. Rivals that end within a few units of chi2 of the best,
+or whose directions coincide, cannot be told apart and form a group.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from .fit import fit
+from .screen import Candidate
+
+LEADERS = 5
+MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
+BIC_DROP = 10.0
+TIE = 9.0  # chi2; rivals nearer than this to the best are not told apart
+SAME_DIRECTION = 0.97
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One candidate fitted from scratch: its fit, what it gained beyond the placebo, whether its sign is physical."""
+
+    candidate: Candidate
+    result: object
+    drop: float
+    bic_change: float
+    physical: bool
+    explained_share: float
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.candidate.name
+
+
+def chi2_of(result) -> float:
+    """Total chi2 of a fit."""
+    return result.chi2_per_sample * result.data_count
+
+
+def leaders(candidates, count: int = LEADERS):
+    """The candidates worth a fit: the highest scores, and those of other blocks that come near the first."""
+    visible = [c for c in candidates if abs(c.z) > 3 and c.visibility > 1e-3]
+    chosen = visible[:count]
+    best = abs(visible[0].z) if visible else 0.0
+    for c in visible[count:]:
+        if c.block not in {x.block for x in chosen} and abs(c.z) > 0.6 * best:
+            chosen.append(c)
+    return chosen
+
+
+def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None) -> Trial:
+    """Fit base + effect from scratch, started at the screening's amplitude."""
+    info = effect_class.parameters()[effect_class.amplitude]
+    reach = max(abs(t) for t in info.typical) if info.typical else 10 * info.scale
+    amplitude = float(np.clip(candidate.amplitude, -reach, reach))
+    effect = effect_class(**candidate.shapes).with_amplitude(amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale)
+    names = tuple(f"effects.{effect.name}.{p}" for p in effect.parameters())
+    held = tuple(f"effects.{e.name}.{p}" for e in base.actuator.effects for p in e.parameters())
+    result = fit(recordings, bench, actuator=base.actuator.with_effect(effect), extra=(*held, *names), choices=choices, refine=False, progress=progress)
+    if not np.isfinite(result.chi2_per_sample):
+        return Trial(candidate, result, 0.0, np.inf, False, 0.0)
+    drop = chi2_of(base) - chi2_of(result)
+    value = result.estimate(f"effects.{effect.name}.{effect.amplitude}").value
+    physical = value >= 0 or not candidate.one_sided
+    extra = len(names) * np.log(result.data_count)
+    tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
+    return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)))
+
+
+def rivals_of(best: Trial, trials) -> list[Trial]:
+    """Trials that the data do not tell from the best, the best first."""
+    tied = [best]
+    for t in trials:
+        if t is best or not t.physical:
+            continue
+        behind = chi2_of(t.result) - chi2_of(best.result)
+        if behind < TIE or (behind < 2 * TIE and _same(t, best)):
+            tied.append(t)
+    return sorted(tied, key=lambda t: chi2_of(t.result))
+
+
+def _same(a: Trial, b: Trial) -> bool:
+    x, y = a.candidate.direction, b.candidate.direction
+    if x is None or y is None or len(x) != len(y):
+        return False
+    return abs(float(x @ y)) > SAME_DIRECTION
+
+
+def confidence(best: Trial, trials) -> float:
+    """Probability of the best among the tried by their BIC, times its share of the excess."""
+    weights = [np.exp(-0.5 * min(max(t.bic_change - best.bic_change, -50.0), 700.0)) for t in trials if t.physical]
+    share = np.clip(best.explained_share, 0.0, 1.0)
+    return float(np.clip(share / max(sum(weights), 1.0), 0.0, 0.99))

@@ -1,0 +1,43 @@
+"""Check recordings: prediction against reading on data that took no part in the fit."""
+
+import numpy as np
+
+from magjax.preisach.memory import nesting
+from magjax.simulate import simulate
+
+from .model import Predictor
+from .spectra import estimate_noise, evaluate_lines, reduce_recording
+
+
+def prediction(actuator, recording, bench):
+    """(predicted, measured, noise rms) over the recording's samples. Periodic drives settle first; others start at rest."""
+    measured = np.asarray(recording.channels[bench.output], float)
+    if recording.frequency() is None:
+        signals = simulate(actuator, recording.channels[bench.drive], recording.dt)
+        return np.asarray(signals.reading), measured, None
+    s = reduce_recording(recording, bench.drive, bench.output)
+    corners = int(4 * np.ceil(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) / 4))
+    lines = np.asarray(Predictor.build([s], 500, 40, 4, corners)(actuator))[0]
+    phases = np.arange(s.samples) * s.dt * s.frequency
+    predicted = evaluate_lines(lines, phases)
+    measured = measured[: s.samples]
+    if bench.output == "flux_density":
+        measured = measured - measured.mean() + predicted.mean()
+    return predicted, measured, estimate_noise([s]).rms
+
+
+def check_errors(before, after, recordings, bench) -> list[dict]:
+    """rms error on each check recording before and after the repair."""
+    unit = {"displacement": "m", "flux_density": "T"}.get(bench.output, "A/m")
+    rows = []
+    for recording in recordings:
+        errors = []
+        noise = None
+        for actuator in (before, after):
+            predicted, measured, noise = prediction(actuator, recording, bench)
+            errors.append(float(np.sqrt(np.mean((predicted - measured) ** 2))))
+        rows.append(
+            {"file": recording.origin.get("file", recording.name), "channel": bench.output, "unit": unit,
+             "rms_before": errors[0], "rms_after": errors[1], "noise_rms": noise if noise is not None else 0.0}
+        )  # fmt: skip
+    return rows

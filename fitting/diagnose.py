@@ -1,0 +1,250 @@
+"""diagnose(recordings, bench): where simulation and recordings differ, what physics was left out, and the repaired model.
+
+Order: data first, then the base fit to its floor, record-level effects between the harmonics, the screening of the
+catalogue off the full tangent space, real fits of the leaders, groups, checks, the next experiment, the verdict.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from magjax.bench import load_bench
+from magjax.effects import CATALOGUE
+
+from .attribute import BIC_DROP, MIN_DROP, chi2_of, confidence, leaders, rivals_of, try_effect
+from .check import check_errors
+from .experiments import next_experiment
+from .fit import fit
+from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
+from .locate import where
+from .screen import screen
+from .setup import Choices
+
+SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
+Z_THRESHOLD = 5.5  # about forty columns are looked at
+RECORD_Z = 8.0
+FULL_SHARE = 0.8
+MAX_EFFECTS = 3
+ABSORBED_VISIBILITY = 0.004
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """The verdict with everything behind it; str() is the message."""
+
+    verdict: str
+    message: str
+    effects: tuple = ()
+    groups: tuple = ()
+    absorbed: tuple = ()
+    unknown: dict | None = None
+    data_problem: str | None = None
+    candidates: tuple = ()
+    floors: dict = dataclasses.field(default_factory=dict)
+    where: dict = dataclasses.field(default_factory=dict)
+    check: tuple = ()
+    next_experiment: dict | None = None
+    base: object = None
+    repaired: object = None
+
+    def __str__(self):
+        return f"{self.verdict}: {self.message}"
+
+    def as_dict(self) -> dict:
+        """The content of diagnosis.json."""
+        ranked = [
+            {
+                "name": c.name, "z": c.z, "visibility": c.visibility, "amplitude": c.amplitude,
+                "predicted_chi2_drop": c.predicted_chi2_drop, "achieved_chi2_drop": c.achieved_chi2_drop,
+                "bic_change": c.bic_change, "smallest_visible": c.smallest_visible,
+            }
+            for c in self.candidates
+        ]  # fmt: skip
+        return {
+            "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
+            "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
+            "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
+            "message": self.message, "base": self.base.as_dict() if self.base else None,
+            "repaired": self.repaired.as_dict() if self.repaired else None,
+        }  # fmt: skip
+
+
+def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = Choices(), progress=None) -> Diagnosis:
+    """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
+
+    `progress` is called as progress(text, step, chi2 per datum). Returns a `Diagnosis`; raises `RecordingError` where a
+    recording cannot be used at all.
+    """
+    bench = load_bench(bench)
+    say = progress or (lambda *a: None)
+    recordings = list(recordings)
+    held = tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
+    base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
+    problem = data_problem(recordings, base.spectra, base.problem.noise, bench.output) or wrong_bench(base)
+    if problem:
+        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
+    say("between the harmonics", 0, base.chi2_per_sample)
+    adopted, recordings, base_now = _record_level(recordings, bench, base, choices, progress)
+    candidates = screen(base_now.problem, base_now.refined)
+    noise = base_now.problem.noise
+    floors = {
+        "noise_rms": noise.rms,
+        "solver_rms": solver_floor(base_now.problem, base_now.solution),
+        "density_rms": float(noise.rms * np.sqrt(max(base_now.chi2_per_sample - 1, 0) / max(np.median([s.samples for s in base.spectra]), 1))),
+    }
+    place = where(base_now, candidates, recordings, bench.output)
+    absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY)
+    state = _search(recordings, bench, base_now, candidates, choices, progress)
+    common = {"floors": floors, "where": place, "absorbed": absorbed, "base": base}
+    return _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common)
+
+
+def _record_level(recordings, bench, base, choices, progress):
+    """Drift, heat and hum: adopted one by one, taken out of the readings, the base fitted again."""
+    adopted, current = [], base
+    for _ in range(2):
+        found = record_effects(recordings, current.spectra, current.problem.noise)
+        best = found[0]
+        if abs(best.z) < RECORD_Z:
+            break
+        rivals = [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z)]
+        adopted.append((best, rivals))
+        recordings = remove_record_effect(recordings, best, bench.output)
+        current = fit(recordings, bench, actuator=base.actuator if base.actuator.effects else None, choices=choices, progress=progress)
+    return adopted, recordings, current
+
+
+@dataclasses.dataclass
+class _State:
+    """What the search has reached: the current fit, adopted trials with their rivals, all trials of the last round."""
+
+    current: object
+    steps: list
+    tried: dict
+    excess: float
+    unexplained: float
+
+
+def _search(recordings, bench, base, candidates, choices, progress) -> _State:
+    """Forward: fit the leaders from scratch, adopt the best while it earns its place; then screen again."""
+    say = progress or (lambda *a: None)
+    classes = {c.name: c for c in CATALOGUE}
+    count = base.data_count
+    floor = min(1.0, base.chi2_per_sample) * count
+    state = _State(base, [], {}, max(chi2_of(base) - floor, 0.0), max(chi2_of(base) - floor, 0.0))
+    # the density chosen for the base may be finer than the default: rivals get the same
+    chosen = choices
+    for _round in range(MAX_EFFECTS):
+        top = leaders(candidates)
+        if not top or abs(top[0].z) < Z_THRESHOLD:
+            break
+        excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
+        trials = []
+        for c in top:
+            say(f"trying {c.name}", 0, state.current.chi2_per_sample)
+            trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress)
+            trials.append(trial)
+            state.tried[c.name] = trial.candidate
+        good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
+        if not good:
+            break
+        best = min(good, key=lambda t: chi2_of(t.result) + (0 if t.result.converged else 5))
+        if state.steps and best.drop < 0.5 * excess and chi2_of(state.current) / count > 1.3 and best.drop < 0.3 * excess:
+            break
+        state.steps.append((best, rivals_of(best, good), good, state.current))
+        state.current = best.result
+        if best.result.chi2_per_sample < 0.9:
+            pass
+        candidates = screen(best.result.problem, best.result.refined)
+    state.unexplained = max(chi2_of(state.current) - count, 0.0)
+    return state
+
+
+def _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common) -> Diagnosis:
+    ranked = tuple(state.tried.get(c.name, c) for c in candidates)
+    before = base.actuator
+    after = state.current.actuator
+    rows = tuple(check_errors(before, after, check, bench)) if check else ()
+    excess = state.current.chi2_per_sample
+    effects, groups = [], []
+    for effect, rivals in adopted:
+        effects.append(_record_row(effect))
+        if rivals:
+            groups.append([effect.name, *[r.name for r in rivals]])
+    last_rivals = []
+    for best, rivals, good, previous in state.steps:
+        if len(rivals) > 1:
+            groups.append([t.name for t in rivals])
+            last_rivals = rivals
+        else:
+            effects.append(_effect_row(best, good, previous, state.current))
+    repaired = state.current if state.steps or adopted else None
+    common = {**common, "candidates": ranked, "check": rows, "repaired": repaired}
+    count = base_now.data_count
+    missing = excess > SILENT_CHI2 + 3 * np.sqrt(2 / count)
+    share = 1 - max(excess - 1, 0) / max(base_now.chi2_per_sample - 1, 1e-9) if base_now.chi2_per_sample > SILENT_CHI2 else 1.0
+    if missing and (not state.steps or share < FULL_SHARE):
+        return _unknown(state, share, excess, common)
+    if not effects and not groups:
+        smallest = min((c.smallest_visible for c in candidates if c.visibility > 0.05), default=None)
+        text = f"nothing is missing: chi2/N = {excess:.2f} and no effect of the catalogue scores above {Z_THRESHOLD} (highest: "
+        text += f"{candidates[0].name}, z = {candidates[0].z:.1f})." if candidates else "none)."
+        del smallest
+        if common["absorbed"]:
+            text += f" These recordings could not show {', '.join(common['absorbed'])}: the density absorbs them."
+        return Diagnosis("nothing_missing", text, **common)
+    better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
+    if groups:
+        experiment = next_experiment(last_rivals, base.spectra, bench, base_now.problem.noise.rms) if last_rivals else None
+        names = "; ".join(" or ".join(g) for g in groups)
+        text = f"something is missing that these recordings cannot tell apart: {names}."
+        if effects:
+            text += f" Found beside it: {', '.join(e['name'] for e in effects)}."
+        if experiment:
+            text += f" Next: {experiment['text']}."
+        return Diagnosis("group", text, tuple(effects), tuple(groups), next_experiment=experiment, **common)
+    named = " and ".join(f"{e['name']} ({e['block']})" for e in effects)
+    text = f"{named} was left out: chi2/N falls from {base.chi2_per_sample:.3g} to {excess:.2f}."
+    text += f" On check recordings: {better}." if better else " Record a check at another frequency to confirm it."
+    return Diagnosis("attributed", text, tuple(effects), **common)
+
+
+def _unknown(state, share, excess, common) -> Diagnosis:
+    blocks = common["where"]["by_block"]
+    block = max(blocks, key=blocks.get) if blocks else "hysteresis"
+    fields = common["where"]["by_field"]
+    region = f"field quarter {int(np.argmax(fields)) + 1} of 4" if fields else ""
+    best = state.steps[0][0].name if state.steps else (common["candidates"][0].name if common["candidates"] else "none")
+    text = (
+        f"something is missing that no effect of the catalogue explains (chi2/N = {excess:.3g} at best; {best} comes nearest and explains "
+        f"{max(share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."
+    )
+    unknown = {"block": block, "region": region, "explained_share": float(np.clip(share, 0, 1))}
+    return Diagnosis("unknown_at", text, unknown=unknown, **common)
+
+
+def _effect_row(trial, tried, previous, final) -> dict:
+    result = final if any(e.name == trial.name for e in final.actuator.effects) else trial.result
+    prefix = f"effects.{trial.name}."
+    parameters = {
+        e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit} for e in result.estimates if e.name.startswith(prefix)
+    }
+    shifts = {}
+    for e in previous.estimates:
+        if e.free and not e.name.startswith("effects."):
+            shifts[e.name] = [e.value, result.estimate(e.name).value]
+    return {
+        "name": trial.name, "block": trial.candidate.block, "parameters": parameters,
+        "confidence": confidence(trial, tried), "shifts": shifts,
+    }  # fmt: skip
+
+
+def _record_row(effect) -> dict:
+    classes = {c.name: c for c in CATALOGUE}
+    kind = classes[effect.name]
+    info = kind.parameters()[kind.amplitude]
+    return {
+        "name": effect.name, "block": kind.block,
+        "parameters": {kind.amplitude: {"value": effect.amplitude, "stderr": effect.stderr, "unit": info.unit}},
+        "confidence": float(np.clip(1 - np.exp(-abs(effect.z) / 4), 0, 0.99)), "shifts": {},
+    }  # fmt: skip

@@ -1,0 +1,143 @@
+"""Floors and data gates: what must be settled before any physics is named.
+
+Noise (between the harmonics), solver (the residual on a finer grid), density (finer hats); and the problems of the
+data themselves: drift, an unsettled start, periods that do not repeat.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from .model import Predictor
+from .spectra import fit_lines
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordEffect:
+    """A record-level effect: amplitude common to the recordings with its score; `columns`: per recording."""
+
+    name: str
+    z: float
+    amplitude: float
+    stderr: float
+    shapes: dict
+    columns: tuple = dataclasses.field(repr=False, default=())
+
+
+def solver_floor(problem, solution) -> float:
+    """Rms change of the reading when the step is halved, unit of the reading."""
+    fine = problem.predictors[1]
+    grids = [d.shape[1] for d in fine.drives]
+    actuator = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
+    twice = Predictor.build(problem.spectra, 2 * min(grids), fine.harmonics, fine.periods, fine.corners)
+    change = np.asarray(twice(actuator) - fine(actuator))[:, 1:]
+    return float(np.sqrt(np.mean(2 * np.sum(np.abs(change) ** 2, axis=1))))
+
+
+def record_columns(recordings, spectra):
+    """(name, shapes, column per recording) of record-level effects at unit amplitude."""
+    rows = []
+    times = [s.dt * np.arange(s.samples) for s in spectra]
+    rows.append(("zero_drift", {}, [t for t in times]))
+    for tau in (0.3, 3.0, 30.0):
+        heat = []
+        for recording, t in zip(recordings, times, strict=True):
+            drive = np.asarray(recording.channels[recording.drive])
+            heat.append(np.mean(drive**2) * tau * (1 - np.exp(-t / tau)))
+        rows.append(("thermal_drift", {"tau": tau}, heat))
+    return rows
+
+
+def record_effects(recordings, spectra, noise) -> list[RecordEffect]:
+    """Drift, heat and hum scored on what the harmonics leave, best first."""
+    found = {}
+    for name, shapes, columns in record_columns(recordings, spectra):
+        top, bottom = 0.0, 0.0
+        for s, column in zip(spectra, columns, strict=True):
+            weight, r, c = _between(s, column, noise)
+            top += float(np.sum(weight * (np.conj(c) * r).real))
+            bottom += float(np.sum(weight * np.abs(c) ** 2))
+        z, amplitude = top / np.sqrt(bottom), top / bottom
+        if name not in found or abs(z) > abs(found[name].z):
+            found[name] = RecordEffect(name, float(z), float(amplitude), float(1 / np.sqrt(bottom)), shapes, tuple(columns))
+    for f in (50.0, 60.0):
+        gain, power, number = 0.0, 0.0, 0
+        fits = []
+        for s in spectra:
+            t = s.dt * np.arange(s.samples)
+            parts = [np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]
+            reduced = [_between(s, p, noise) for p in parts]
+            G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
+            g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
+            if np.trace(G) < 1e-3 * s.samples / max(noise.white, 1e-300):
+                fits.append(np.zeros(s.samples))
+                continue
+            best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(2), g)
+            gain += float(best @ g)
+            number += 2
+            power = max(power, float(np.hypot(*best)))
+            fits.append(best[0] * parts[0] + best[1] * parts[1])
+        z = (gain - number) / np.sqrt(2 * max(number, 1))
+        if "mains_hum" not in found or z > found["mains_hum"].z:
+            found["mains_hum"] = RecordEffect("mains_hum", float(z), power, power / max(np.sqrt(gain), 1e-9), {"f": f}, tuple(fits))
+    return sorted(found.values(), key=lambda e: -abs(e.z))
+
+
+def _between(s, column, noise):
+    """Weights, residue and column in the frequency domain, both without the harmonics."""
+    phases = np.arange(s.samples) * s.dt * s.frequency
+    left = fit_lines(np.asarray(column, float), phases, len(s.reading) - 1)[1]
+    f = np.fft.rfftfreq(s.samples, s.dt)
+    weight = 2.0 / (s.samples * noise.density(np.maximum(f, f[1])))
+    weight[0] = 0.0
+    return weight, np.fft.rfft(s.residue), np.fft.rfft(left)
+
+
+def remove_record_effect(recordings, effect, output):
+    """The recordings with a record-level signal taken out of the reading."""
+    from magjax.recording import Recording
+
+    cleaned = []
+    for recording, column in zip(recordings, effect.columns, strict=True):
+        signal = np.zeros(len(recording.time))
+        scale = 1.0 if effect.name == "mains_hum" else effect.amplitude
+        signal[: len(column)] = scale * column
+        if len(column) < len(signal):
+            signal[len(column) :] = signal[len(column) - 1]
+        channels = {**recording.channels, output: recording.channels[output] - signal}
+        cleaned.append(Recording(recording.time, channels, recording.noise, recording.origin, recording.name))
+    return cleaned
+
+
+def data_problem(recordings, spectra, noise, output) -> str | None:
+    """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
+    for recording, s in zip(recordings, spectra, strict=True):
+        y = np.asarray(recording.channels[output])[: s.samples]
+        step = int(round(s.samples / s.periods))
+        if s.periods >= 2:
+            blocks = y[: step * s.periods].reshape(s.periods, step)
+            first = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))
+            later = float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if s.periods > 2 else 0.0
+            floor = np.sqrt(2 * noise.white)
+            if first > 0.03 * s.peak_to_peak and first > 8 * floor and first > 4 * later:
+                return (
+                    f"{recording.name}: the first period differs from the last by {first:.3g} rms and later ones do not: an unsettled "
+                    "transient; cut the first periods or wait before recording"
+                )
+            moved = float(np.abs(blocks[-1].mean() - blocks[0].mean()))
+            if moved > 0.05 * s.peak_to_peak and moved > 8 * floor:
+                return f"{recording.name}: the reading drifts by {moved:.3g} through the record; let it warm up, or remove the drift first"
+    return None
+
+
+def wrong_bench(result) -> str | None:
+    """A bench file that cannot be this bench: swapped sign of the reading."""
+    correlation = []
+    for s in result.spectra:
+        if len(s.reading) > 1 and abs(s.drive[1]) > 0:
+            correlation.append(np.angle(s.reading[1] / s.drive[1]))
+    slow = [c for c, s in zip(correlation, result.spectra, strict=True) if s.frequency <= min(x.frequency for x in result.spectra) * 1.01]
+    if slow and all(abs(c) > 0.75 * np.pi for c in slow) and result.chi2_per_sample > 20:
+        return "the reading falls where the drive rises at the lowest frequency: the sign of a channel is swapped; set scale = -1 in [columns]"
+    return None

@@ -1,0 +1,258 @@
+"""Screening: what each effect of the catalogue would do to the misfit, to first order, beside everything the base can do.
+
+For a candidate with amplitude a the column is c = d(whitened misfit)/da at null. Projected off the tangent space of the
+base fit (all density unknowns with a tenth of their roughness weights, all free parameters), z = c_perp . r / |c_perp|
+is the score in standard deviations, z^2 the predicted fall of chi2, and |c_perp|/|c| the visibility. Shape parameters,
+which mean nothing at null, are scanned over a log grid. Record-level effects (drift, heat, hum) are scored in the time
+domain between the harmonics.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from magjax.chain import Timeline
+from magjax.chain.coupled import magnetize
+from magjax.effects import CATALOGUE
+from magjax.simulate import finish_chain
+
+from .joint import data_jacobian, data_residual
+from .model import whitened
+from .uncertainty import UNDERSMOOTH
+
+SHAPE_GRIDS = {
+    "excess_loss": {"rate_knee": (0.3, 10.0, 100.0)},
+    "field_diffusion": {"tau": (5e-5, 2e-4, 8e-4, 3e-3)},
+    "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3)},
+    "rate_dependent_switching": {"rate0": (0.3, 10.0, 100.0)},
+    "amplifier_clipping": {"tau_L": (0.0, 1e-3)},
+    "second_mode": {"f2": (150.0, 250.0, 400.0, 650.0, 900.0, 1300.0, 2000.0, 3000.0), "xi2": (0.02, 0.1)},
+    "coulomb_friction": {"v_s": (1e-5, 3e-4, 3e-3)},
+    "sensor_lag": {"order2": (0.0, 0.5)},
+    "sensor_nonlinearity": {"q3": (0.0,)},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """One effect's score. `amplitude`: first-order estimate in its unit; `shapes`: best of the grid;
+    `smallest_visible`: amplitude seen at five standard deviations; `direction`: projected unit column."""
+
+    name: str
+    block: str
+    z: float
+    visibility: float
+    amplitude: float
+    shapes: dict
+    predicted_chi2_drop: float
+    smallest_visible: float
+    one_sided: bool
+    direction: np.ndarray = dataclasses.field(repr=False, default=None)
+    achieved_chi2_drop: float | None = None
+    bic_change: float | None = None
+
+
+def shape_grid(effect_class):
+    """All combinations of shape parameters to try: list of dicts."""
+    grid = [{}]
+    for name, values in SHAPE_GRIDS.get(effect_class.name, {}).items():
+        grid = [{**g, name: v} for g in grid for v in values]
+    return grid
+
+
+def applicable(actuator):
+    """Effects of the catalogue whose block this actuator has, and that it does not hold already."""
+    held = {e.name for e in actuator.effects}
+    found = []
+    for effect in CATALOGUE:
+        if effect.name in held:
+            continue
+        if effect.block in ("magnetostriction", "mechanics") and getattr(actuator, effect.block) is None:
+            continue
+        if effect.name in ("stress_feedback",) and actuator.mechanics is None:
+            continue
+        found.append(effect)
+    return found
+
+
+@eqx.filter_jit
+def _steady_state(predictor, actuator):
+    """Field and magnetization over the last period of every recording, grid by grid."""
+
+    def one(drive, dt):
+        from magjax.simulate import run_chain
+
+        s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners, "trapezoid")
+        return s.field, s.magnetization
+
+    return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
+
+
+@eqx.filter_jit
+def _late_columns(predictor, actuator, states, effects):
+    """d lines / d amplitude of effects behind the hysteresis: no march, only the blocks after it."""
+
+    def lines_of(effect, amplitude):
+        changed = dataclasses.replace(actuator, effects=(*actuator.effects, effect.with_amplitude(amplitude)))
+
+        def one(drive, dt, H, M):
+            line = Timeline(dt, drive.shape[0], True)
+            zero = jnp.zeros(())
+            s = finish_chain(changed, line, drive, changed_drive(actuator, drive, line), H, M, H, H, zero)
+            return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / drive.shape[0]
+
+        parts = [jax.vmap(one)(d, t, H, M) for d, t, (H, M) in zip(predictor.drives, predictor.steps, states, strict=True)]
+        return jnp.concatenate(parts)[np.asarray(predictor.index)]
+
+    return [jax.jvp(lambda a, e=e: lines_of(e, a), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1] for e in effects]
+
+
+def changed_drive(actuator, drive, line):
+    """The coil current behind the source and its effects."""
+    current = actuator.source(drive)
+    for effect in actuator.effects:
+        current = effect.drive(current, line, actuator)
+    return current
+
+
+@eqx.filter_jit
+def _march_columns(predictor, actuator, effects, directions):
+    """d lines / d amplitude of in-step effects and of changes of the drive, all in one program.
+
+    `effects`: at null; `directions`: (columns, effects) of amplitudes; the last rows belong to drive changes, which
+    enter as (columns, ...) perturbations of the drive per grid in `directions[1]`.
+    """
+    amplitudes, drive_changes = directions
+    whole = dataclasses.replace(actuator, effects=(*actuator.effects, *effects))
+    base = len(actuator.effects)
+
+    def lines_of(values, changes):
+        changed = whole
+        for k, e in enumerate(effects):
+            changed = eqx.tree_at(lambda a, k=k, e=e: getattr(a.effects[base + k], e.amplitude), changed, values[k])
+
+        def one(drive, dt, change):
+            count = drive.shape[0]
+            line = Timeline(dt, count, True)
+            current = changed_drive(actuator, drive, line) + change
+            applied = changed.coil.applied_field(current)
+            table = changed.hysteresis.table()
+            memory = changed.hysteresis.memory(table, predictor.corners)
+            whole_drive = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (applied, current)]
+            H, M, v, res, over = magnetize(changed, *whole_drive, dt, memory)
+            H, M, v, res = (x[-count - 1 : -1] for x in (H, M, v, res))
+            s = finish_chain(changed, line, drive, current, H, M, v, res, over)
+            return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / count
+
+        parts = [jax.vmap(one)(d, t, c) for d, t, c in zip(predictor.drives, predictor.steps, changes, strict=True)]
+        return jnp.concatenate(parts)[np.asarray(predictor.index)]
+
+    zero_drive = tuple(jnp.zeros_like(d) for d in predictor.drives)
+    origin = (jnp.zeros(len(effects)), zero_drive)
+    _, push = jax.linearize(lines_of, *origin)
+    return jax.lax.map(lambda d: push(*d), (amplitudes, drive_changes), batch_size=8)
+
+
+def columns(problem, z):
+    """First-order change of the whitened misfit by every applicable effect: list of (class, shapes, column)."""
+    actuator = problem.layout.actuator(problem.template, jnp.asarray(z))
+    predictor = problem.predictors[0]
+    classes = [c for c in applicable(actuator) if not c.record_level]
+    found = []
+    late = [(c, shapes) for c in classes if not c.in_step and c.block != "source" for shapes in shape_grid(c)]
+    states = _steady_state(predictor, actuator)
+    if late:
+        lines = _late_columns(predictor, actuator, states, tuple(c(**shapes) for c, shapes in late))
+        found += [(c, shapes, line) for (c, shapes), line in zip(late, lines, strict=True)]
+    marching = [c for c in classes if c.in_step]
+    sources = [(c, shapes) for c in classes if c.block == "source" for shapes in shape_grid(c)]
+    rounds = max([len(shape_grid(c)) for c in marching], default=1)
+    for r in range(rounds):
+        chosen = [shape_grid(c)[min(r, len(shape_grid(c)) - 1)] for c in marching]
+        fresh = [k for k, c in enumerate(marching) if r < len(shape_grid(c))]
+        extra = sources if r == 0 else []
+        width = len(marching) + len(sources)
+        amplitudes = np.zeros((width, len(marching)))
+        amplitudes[np.arange(len(marching)), np.arange(len(marching))] = 1.0
+        changes = tuple(np.zeros((width, *d.shape)) for d in predictor.drives)
+        for k, (c, shapes) in enumerate(extra):
+            for g, (drive, dt) in enumerate(zip(predictor.drives, predictor.steps, strict=True)):
+                changes[g][len(marching) + k] = _drive_change(c(**shapes), drive, dt, actuator)
+        effects = tuple(c(**s) for c, s in zip(marching, chosen, strict=True))
+        lines = _march_columns(predictor, actuator, effects, (jnp.asarray(amplitudes), tuple(jnp.asarray(c) for c in changes)))
+        found += [(marching[k], chosen[k], lines[k]) for k in fresh]
+        found += [(c, s, lines[len(marching) + k]) for k, (c, s) in enumerate(extra)]
+    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
+    return [(c, s, np.asarray(whitened(line, zero))) for c, s, line in found]
+
+
+def _drive_change(effect, drive, dt, actuator):
+    def one(d, h):
+        line = Timeline(h, d.shape[0], True)
+        return jax.jvp(lambda a: effect.with_amplitude(a).drive(d, line, actuator), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
+
+    return np.asarray(jax.vmap(one)(drive, dt))
+
+
+class Projector:
+    """Projects columns off the tangent space of a fit, prior rows included."""
+
+    def __init__(self, problem, solution):
+        layout = problem.layout
+        n = layout.density_unknowns
+        z = solution.z
+        J = data_jacobian(problem, z)
+        free = np.append(z[:n] > 0, np.ones(len(z) - n, bool))
+        rows, leftover = [], []
+        for w, D in zip(UNDERSMOOTH * solution.weights, layout.penalties, strict=True):
+            rows.append(np.sqrt(w) * np.asarray(D))
+            leftover.append(rows[-1] @ z[:n])
+        prior = np.zeros((sum(len(r) for r in rows) + len(layout.names), len(z)))
+        at = 0
+        for r in rows:
+            prior[at : at + len(r), :n] = r
+            at += len(r)
+        prior[at:, n + 1 :] = np.diag(np.asarray(problem.target.priors))
+        whole = np.concatenate([J, prior])[:, free]
+        scale = np.linalg.norm(whole, axis=0)
+        whole = whole[:, scale > 0] / scale[scale > 0]
+        self.basis, _ = np.linalg.qr(whole)
+        self.count = len(J)
+        r = np.concatenate([data_residual(problem, z), *leftover, np.asarray(problem.target.priors) * z[n + 1 :]])
+        self.residual = r - self.basis @ (self.basis.T @ r)
+        self.raw = r
+
+    def project(self, column):
+        """The part of a data column that the base cannot make."""
+        whole = np.concatenate([column, np.zeros(len(self.raw) - self.count)])
+        for _ in range(2):
+            whole = whole - self.basis @ (self.basis.T @ whole)
+        return whole
+
+
+def screen(problem, solution) -> list[Candidate]:
+    """Every applicable periodic effect, best first."""
+    projector = Projector(problem, solution)
+    best: dict[str, Candidate] = {}
+    for effect, shapes, column in columns(problem, solution.z):
+        size = np.linalg.norm(column)
+        if not np.isfinite(size) or size == 0:
+            continue
+        part = projector.project(column)
+        length = np.linalg.norm(part)
+        score = -float(part @ projector.residual) / max(length, 1e-300)
+        info = effect.parameters()[effect.amplitude]
+        one_sided = info.low >= 0
+        z = max(score, 0.0) if one_sided else score
+        if length / size < 1e-4:
+            z = 0.0
+        candidate = Candidate(
+            effect.name, effect.block, z, float(length / size), score / max(length, 1e-300), shapes, float(z * z),
+            float(5 / max(length, 1e-300)), one_sided, part / max(length, 1e-300),
+        )  # fmt: skip
+        if effect.name not in best or abs(candidate.z) > abs(best[effect.name].z):
+            best[effect.name] = candidate
+    return sorted(best.values(), key=lambda c: -abs(c.z))
