@@ -12,7 +12,9 @@ import numpy as np
 from .fit import fit
 from .screen import Candidate
 
-LEADERS = 5
+LEADERS = 4
+SETTLED_CHI2 = 1.12  # a leader that reaches this leaves only close rivals to try
+CLOSE = 0.8  # share of the best score that makes a close rival
 MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
 BIC_DROP = 10.0
 TIE = 9.0  # chi2; rivals nearer than this to the best are not told apart
@@ -47,7 +49,7 @@ def leaders(candidates, count: int = LEADERS):
     chosen = visible[:count]
     best = abs(visible[0].z) if visible else 0.0
     for c in visible[count:]:
-        if c.block not in {x.block for x in chosen} and abs(c.z) > 0.6 * best:
+        if c.block not in {x.block for x in chosen} and abs(c.z) > 0.7 * best:
             chosen.append(c)
     return chosen
 

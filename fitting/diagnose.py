@@ -11,10 +11,10 @@ import numpy as np
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 
-from .attribute import BIC_DROP, MIN_DROP, chi2_of, confidence, leaders, rivals_of, try_effect
+from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, TIE, chi2_of, confidence, leaders, rivals_of, try_effect
 from .check import check_errors
 from .experiments import next_experiment
-from .fit import fit
+from .fit import REFINE_BETWEEN, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
 from .locate import where
 from .screen import screen
@@ -132,8 +132,7 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
     count = base.data_count
     floor = min(1.0, base.chi2_per_sample) * count
     state = _State(base, [], {}, max(chi2_of(base) - floor, 0.0), max(chi2_of(base) - floor, 0.0))
-    # the density chosen for the base may be finer than the default: rivals get the same
-    chosen = choices
+    chosen = base.choices  # the density chosen for the base may be finer than the default: rivals get the same
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
         if not top or abs(top[0].z) < Z_THRESHOLD:
@@ -141,6 +140,9 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
         excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
         trials = []
         for c in top:
+            settled = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
+            if settled and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
+                continue
             say(f"trying {c.name}", 0, state.current.chi2_per_sample)
             trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress)
             trials.append(trial)
@@ -151,13 +153,27 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
         best = min(good, key=lambda t: chi2_of(t.result) + (0 if t.result.converged else 5))
         if state.steps and best.drop < 0.5 * excess and chi2_of(state.current) / count > 1.3 and best.drop < 0.3 * excess:
             break
+        best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress)
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
-        if best.result.chi2_per_sample < 0.9:
-            pass
         candidates = screen(best.result.problem, best.result.refined)
     state.unexplained = max(chi2_of(state.current) - count, 0.0)
     return state
+
+
+def _finer(recordings, bench, current, best, good, chosen, excess, progress):
+    """Where the best still leaves a little and a finer density takes it: the tied rivals again on that density."""
+    if chosen.knots is None or not REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BETWEEN[1]:
+        return best, good, chosen
+    names = tuple(e.name for e in best.result.estimates if e.name.startswith("effects."))
+    finer = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=chosen, refine=True, progress=progress).choices
+    if finer == chosen:
+        return best, good, chosen
+    classes = {c.name: c for c in CATALOGUE}
+    near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
+    again = [try_effect(recordings, bench, current, t.candidate, classes[t.name], finer, excess, progress) for t in near]
+    again = [t for t in again if t.physical] or [best]
+    return min(again, key=lambda t: chi2_of(t.result)), again, finer
 
 
 def _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common) -> Diagnosis:

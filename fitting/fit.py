@@ -9,13 +9,14 @@ import numpy as np
 from magjax.bench import load_bench
 from magjax.simulate import require_x64
 
-from .joint import data_residual, solve
+from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
 from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
 from .spectra import estimate_noise
-from .uncertainty import UNDERSMOOTH, correlations, estimates
+from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 FINER_KNOTS = ((26, 18), (36, 24))
+REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
 
 
 def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None) -> FitResult:
@@ -35,45 +36,27 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     names = free_parameters(bench, actuator, extra)
     report = (lambda *a: None) if progress is None else progress
     problem, z = build_problem(spectra, noise, actuator, bench, names, choices, start)
-    first = solve(problem, z, START_WEIGHTS, max_jacobians=1, evidence=False)
+    data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
     solution = solve(problem, z, START_WEIGHTS, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
-    del first
     if refine and choices.knots is not None:
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, noise, report)
-    return finish(problem, solution, actuator, bench, recordings, warm)
-
-
-def _evidence(problem, solution) -> float:
-    """Minus twice the log evidence (Laplace), up to a constant that all density bases share."""
-    z, layout = solution.z, problem.layout
-    n = layout.density_unknowns
-    prior = np.zeros((n, n))
-    for w, D in zip(solution.weights, layout.penalties, strict=True):
-        prior += w * np.asarray(D).T @ np.asarray(D)
-    free = np.append(z[:n] > 0, np.ones(len(z) - n, bool))
-    index = np.flatnonzero(free)
-    _, logdet = np.linalg.slogdet(solution.normal[np.ix_(index, index)])
-    ridge = 1e-6 * np.trace(prior) / n * np.eye(n)
-    inside = index[index < n]
-    _, logprior = np.linalg.slogdet((prior + ridge)[np.ix_(inside, inside)])
-    return 2 * solution.cost + logdet - logprior
+    return finish(problem, solution, choices, bench, recordings, warm)
 
 
 def _refine_density(problem, solution, actuator, bench, names, choices, spectra, noise, report):
     """Finer hats where chi2 stays above the noise and they lower it clearly."""
     count = problem.data_count
     for knots in FINER_KNOTS:
-        if solution.chi2 / count < 1.05 or not np.isfinite(solution.chi2) or solution.chi2 / count > 400:
+        if not REFINE_BETWEEN[0] < solution.chi2 / count < REFINE_BETWEEN[1]:
             break
         finer = dataclasses.replace(choices, knots=knots, level=max(choices.level, 4 * knots[0]))
-        current = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
         started = _resample(problem, solution, spectra, noise, actuator, bench, names, finer)
         trial_problem, z = started
         z = _with_parameters(trial_problem, z, problem, solution)
         trial = solve(trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("finer density", k, c))
-        del current
-        if not trial.chi2 < solution.chi2 - 30 - 0.02 * count:
+        excess = [max(s.chi2 - 0.95 * count, 0.0) for s in (solution, trial)]
+        if not (excess[1] < 0.7 * excess[0] and trial.chi2 < solution.chi2 - 25):
             break
         problem, solution, choices = trial_problem, trial, finer
     return problem, solution, choices
@@ -93,7 +76,7 @@ def _resample(problem, solution, spectra, noise, actuator, bench, names, choices
     return build_problem(spectra, noise, actuator.replace(values), bench, names, choices)
 
 
-def finish(problem, solution, actuator, bench, recordings, warm=0.0) -> FitResult:
+def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult:
     """Estimates (quoted with a tenth of the roughness weights), per-recording misfit, outcome."""
     fitted = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
     count = problem.data_count
@@ -104,20 +87,14 @@ def finish(problem, solution, actuator, bench, recordings, warm=0.0) -> FitResul
     rows = estimates(problem, refined, quoted)
     residual = data_residual(problem, solution.z)
     per_recording = recording_fits(problem, residual, recordings, bench)
-    n = problem.layout.density_unknowns
-    prior = np.zeros_like(solution.normal)
-    for w, D in zip(solution.weights, problem.layout.penalties, strict=True):
-        prior[:n, :n] += w * np.asarray(D).T @ np.asarray(D)
-    from .uncertainty import covariance
-
-    cov = covariance(solution.normal, solution.z, n)
-    effective = float(np.trace(cov @ (solution.normal - prior)))
+    cov = covariance(solution.normal, solution.z, problem.layout.density_unknowns)
+    effective = float(np.trace(cov @ (solution.normal - prior_matrix(problem, solution.weights))))
     chi2n = solution.chi2 / count
     message = outcome(chi2n, per_recording, solution, rows, problem)
     return FitResult(
         fitted, bench, bool(solution.converged), message, tuple(rows), correlations(problem, refined), per_recording, float(chi2n), count,
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
-        problem.spectra,
+        problem.spectra, choices,
     )  # fmt: skip
 
 

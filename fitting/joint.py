@@ -1,6 +1,6 @@
 """The joint fit: all recordings at once, every free parameter, to the noise.
 
-Harmonics in, projected Levenberg-Marquardt through optimistix's step interface, roughness weights by evidence
+Harmonics in, the steps of the projected Levenberg-Marquardt solver, roughness weights by evidence
 (MacKay) while it runs, the residual on a finer grid than the Jacobian.
 """
 
@@ -11,8 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .model import Layout, Predictor, Target, prior_rows, whitened
-from .solver import ProjectedLevenbergMarquardt, jacobian
+from .model import Layout, Predictor, Target, whitened
+from .solver import damped_step, jacobian
 
 WEIGHT_RANGE = (1e-3, 1e9)
 
@@ -55,23 +55,6 @@ class Solution:
     seconds: float
 
 
-def _residual(which: int):
-    def fn(z, args):
-        layout, target, template, predictors = args
-        lines = predictors[which](layout.actuator(template, z))
-        return jnp.concatenate([whitened(lines, target), prior_rows(layout, z, target)]), None
-
-    return fn
-
-
-@eqx.filter_jit
-def _step(layout, z, state, target, template, predictors):
-    solver = ProjectedLevenbergMarquardt(jnp.asarray(layout.nonnegative))
-    args = (layout, target, template, predictors)
-    z, state, _ = solver.step(_residual(1), z, args, {"jacobian_fn": _residual(0)}, state, frozenset())
-    return z, state
-
-
 @eqx.filter_jit
 def _data_residual(layout, z, target, template, predictors):
     return whitened(predictors[1](layout.actuator(template, z)), target)
@@ -92,11 +75,10 @@ def data_jacobian(problem: Problem, z):
     return np.asarray(_data_jacobian(problem.layout, jnp.asarray(z), problem.target, problem.template, problem.predictors))
 
 
-def evidence_weights(layout: Layout, z, normal, weights, misfit: float):
-    """One MacKay update of each roughness weight: effective number of unknowns over roughness, times the misfit."""
+def evidence_weights(layout: Layout, z, normal, weights):
+    """One MacKay update of each roughness weight: effective number of unknowns over roughness."""
     n = layout.density_unknowns
     z = np.asarray(z)
-    S = np.linalg.inv(normal + 1e-10 * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(normal)))
     active = np.append(z[:n] > 0, np.ones(len(z) - n, bool))
     # unknowns at their bound carry no freedom: the inverse on the free set only
     inside = np.flatnonzero(active)
@@ -111,38 +93,72 @@ def evidence_weights(layout: Layout, z, normal, weights, misfit: float):
         rank = np.linalg.matrix_rank(D)
         taken = weight * np.einsum("ij,jk,ik->", D, S[:n, :n][np.ix_(active[:n], active[:n])], D)
         gamma = max(rank - taken, 0.5)
-        new.append(np.clip(misfit * gamma / max(roughness, 1e-12), *WEIGHT_RANGE))
+        new.append(np.clip(gamma / max(roughness, 1e-12), *WEIGHT_RANGE))
     return np.asarray(new)
 
 
+def prior_matrix(problem: Problem, weights) -> np.ndarray:
+    """Curvature of half the prior's sum of squares: roughness penalties and stated priors, (unknowns, unknowns)."""
+    layout = problem.layout
+    n = layout.density_unknowns
+    matrix = np.zeros((layout.size, layout.size))
+    for weight, D in zip(weights, layout.penalties, strict=True):
+        D = np.asarray(D)
+        matrix[:n, :n] += weight * (D.T @ D)
+    matrix[n, n] += float(problem.target.bottom_prior) ** 2
+    matrix[n + 1 :, n + 1 :] += np.diag(np.asarray(problem.target.priors) ** 2)
+    return matrix
+
+
 def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None) -> Solution:
-    """Minimise from z. `progress(step, chi2 per datum)` is called after each Jacobian; Ctrl-C keeps what was reached."""
+    """Minimise from z, one Jacobian and a few trial dampings a step.
+
+    The steps are those of `ProjectedLevenbergMarquardt`, driven from Python with the two compiled functions that the
+    screening uses too (half the compilation). `progress(step, chi2 per datum)` is called after each Jacobian; Ctrl-C
+    keeps what was reached.
+    """
     layout, count = problem.layout, problem.data_count
-    z, weights = jnp.asarray(z), np.asarray(weights, float)
-    solver = ProjectedLevenbergMarquardt(jnp.asarray(layout.nonnegative))
-    state = solver.init(None, z, None, {}, None, None, None)
-    begin, converged, taken, chi2 = time.perf_counter(), False, 0, np.inf
+    bounded = jnp.asarray(layout.nonnegative)
+    z, weights = np.asarray(z, float), np.asarray(weights, float)
+    prior = prior_matrix(problem, weights)
+    begin, converged, taken, damping, decrement = time.perf_counter(), False, 0, 1e-2, np.inf
+    residual = data_residual(problem, z)
+    chi2 = float(residual @ residual)
+    cost = 0.5 * (chi2 + z @ prior @ z)
+    normal = prior
     try:
         for taken in range(1, max_jacobians + 1):
-            current = problem.with_weights(weights)
-            z, state = _step(layout, z, state, current.target, problem.template, problem.predictors)
-            prior = 0.5 * float(jnp.sum(prior_rows(layout, z, current.target) ** 2))
-            chi2 = 2 * (float(state.cost) - prior)
+            J = data_jacobian(problem, z)
+            normal, gradient = J.T @ J + prior, J.T @ residual + prior @ z
+            good = False
+            for _ in range(8):
+                new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounded))
+                trial = data_residual(problem, new)
+                new_cost = 0.5 * float(trial @ trial + new @ prior @ new)
+                ratio = (cost - new_cost) / max(float(predicted), 1e-300)
+                good = bool(np.isfinite(new_cost) and ratio > 1e-3)
+                damping = max(damping * (0.15 if ratio > 0.5 else 1.0 if good else 6.0), 1e-9)
+                if good or float(predicted) < 1e-6 * cost + 1e-3:
+                    break
+            decrement = float(damped_step(normal, gradient, z, 1e-9, bounded)[1])
+            if good:
+                z, residual, cost = new, trial, new_cost
+            chi2 = float(residual @ residual)
             if progress is not None:
                 progress(taken, chi2 / count)
-            settled = float(state.decrement) < 0.5 + 1e-4 * float(state.cost)
+            settled = decrement < 0.5 + 1e-4 * cost
             if evidence and chi2 / count < 20:
-                misfit = 1.0
-                new = evidence_weights(layout, z, np.asarray(state.normal), weights, misfit)
-                moved = np.max(np.abs(np.log(new / weights)))
-                weights = weights * np.clip(new / weights, 1 / 30, 30)
+                found = evidence_weights(layout, z, normal, weights)
+                moved = np.max(np.abs(np.log(found / weights)))
+                weights = weights * np.clip(found / weights, 1 / 30, 30)
+                prior = prior_matrix(problem, weights)
+                cost = 0.5 * (chi2 + z @ prior @ z)
                 settled = settled and moved < 0.3
-            if settled or (bool(state.done) and not evidence):
-                converged = bool(float(state.decrement) < 1.0 + 1e-3 * float(state.cost))
-                break
+            if settled or not good:
+                converged = decrement < 1.0 + 1e-3 * cost
+                if settled or not evidence or decrement < 1.0:
+                    break
+                damping = min(damping, 1e2)
     except KeyboardInterrupt:
         converged = False
-    return Solution(
-        np.asarray(z), weights, chi2, float(state.cost), float(state.decrement), np.asarray(state.normal), taken, converged,
-        time.perf_counter() - begin,
-    )  # fmt: skip
+    return Solution(z, weights, chi2, cost, decrement, normal, taken, converged, time.perf_counter() - begin)

@@ -44,6 +44,7 @@ class FitResult:
     solution: object = dataclasses.field(repr=False, default=None)
     refined: object = dataclasses.field(repr=False, default=None)
     spectra: tuple = dataclasses.field(repr=False, default=())
+    choices: object = dataclasses.field(repr=False, default=None)
 
     def estimate(self, name: str):
         """The estimate of one parameter by name."""

@@ -32,7 +32,7 @@ class Choices:
     fine: int = 500
     periods: int = 3
     harmonics: int = HARMONICS
-    max_jacobians: int = 40
+    max_jacobians: int = 30
     sensor_offset: bool = False
 
 

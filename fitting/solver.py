@@ -54,15 +54,10 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         residual, aux = fn(y, args)
         cost = 0.5 * jnp.sum(residual**2)
         normal, gradient = normal_equations(lambda z: jacobian_fn(z, args)[0], y, residual)
-        scale = jnp.diagonal(normal)
-        scale = scale + 1e-12 * jnp.max(scale)
 
         def attempt(carry):
             damping, _, _, _, tried = carry
-            delta = bounded_step(normal + jnp.diag(damping * scale), gradient, y, self.nonnegative)
-            new = jnp.where(self.nonnegative, jnp.maximum(y + delta, 0.0), y + delta)
-            delta = new - y
-            predicted = -(gradient @ delta + 0.5 * delta @ normal @ delta)
+            new, predicted = damped_step(normal, gradient, y, damping, self.nonnegative)
             new_cost = 0.5 * jnp.sum(fn(new, args)[0] ** 2)
             ratio = (cost - new_cost) / jnp.maximum(predicted, 1e-300)
             good = (ratio > 1e-3) & jnp.isfinite(new_cost)
@@ -71,9 +66,7 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         start = (state.damping, y, cost, jnp.asarray(False), jnp.asarray(0))
         damping, new, new_cost, good, _ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < self.trials), attempt, start)
-        full = bounded_step(normal + jnp.diag(1e-9 * scale), gradient, y, self.nonnegative)
-        full = jnp.where(self.nonnegative, jnp.maximum(y + full, 0.0), y + full) - y
-        decrement = -(gradient @ full + 0.5 * full @ normal @ full)
+        _, decrement = damped_step(normal, gradient, y, 1e-9, self.nonnegative)
         fallen = cost - new_cost
         tolerance = self.atol + self.rtol * new_cost
         done = (decrement < tolerance) | ~good
@@ -89,6 +82,17 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         return y, aux, {"decrement": state.decrement, "normal": state.normal}
+
+
+@jax.jit
+def damped_step(normal, gradient, y, damping, nonnegative):
+    """The bounded step under a damping relative to the diagonal: (new point, predicted fall of half chi2)."""
+    scale = jnp.diagonal(normal)
+    scale = scale + 1e-12 * jnp.max(scale)
+    delta = bounded_step(normal + jnp.diag(damping * scale), gradient, y, nonnegative)
+    new = jnp.where(nonnegative, jnp.maximum(y + delta, 0.0), y + delta)
+    delta = new - y
+    return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
 
 
 def jacobian(fn, y, chunk: int = CHUNK):

@@ -200,3 +200,19 @@ def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, corne
         return {**results, "reading": y, "field": signals.field} if keep else results
 
     return jax.vmap(one)(frequency, amplitude, offset)
+
+
+UNITS = {
+    "command": "A", "current": "A", "field": "A/m", "magnetization": "A/m", "flux_density": "T",
+    "free_displacement": "m", "displacement": "m", "relay_field": "A/m",
+}  # fmt: skip
+
+
+def signals_dataset(signals: Signals, bench: str = ""):
+    """Every signal as a labelled xarray Dataset with units."""
+    import xarray as xr
+
+    time = np.asarray(signals.time)
+    values = {n: np.asarray(getattr(signals, n)) for n in UNITS if getattr(signals, n) is not None}
+    data = {n: ("time", v, {"units": UNITS[n]}) for n, v in values.items()}
+    return xr.Dataset(data, coords={"time": ("time", time, {"units": "s"})}, attrs={"bench": bench})

@@ -1,0 +1,150 @@
+"""Commands fit, diagnose, demo, report."""
+
+import json
+import sys
+from pathlib import Path
+
+from magjax.errors import ConfigurationError
+
+from .runtime import Progress, output_folder, parser, prepare_jax
+
+
+def run(command: str, arguments: list[str]) -> int:
+    """Run one of the commands of this module."""
+    return {"fit": run_fit, "diagnose": run_diagnose, "demo": run_demo, "report": run_report}[command](arguments)
+
+
+def _reproduce(command, arguments):
+    import shlex
+
+    return "magjax " + command + " " + " ".join(shlex.quote(a) for a in arguments)
+
+
+def _bench_and_start(options):
+    from magjax.bench import load_bench
+
+    if options.model:
+        from magjax.model_file import load_model
+
+        actuator, bench = load_model(options.model)
+        return (load_bench(options.bench) if options.bench else bench), actuator
+    if not options.bench:
+        raise ConfigurationError("give --bench (a TOML file or aa-050h), or --model with a fitted folder")
+    return load_bench(options.bench), None
+
+
+def _common(command, text, example):
+    p = parser(command, text, example)
+    p.add_argument("recordings", nargs="+", help="recordings (CSV, NetCDF, .mat)")
+    p.add_argument("--bench", help="bench file (TOML) or a built-in name")
+    p.add_argument("--model", help="start from a fitted result folder")
+    p.add_argument("--check", nargs="+", default=[], help="recordings to predict that take no part in the fit")
+    p.add_argument("--out", help="folder for the results and the report")
+    p.add_argument("--max-jacobians", type=int, default=30, help="limit of the iteration (default 30)")
+    return p
+
+
+def run_fit(arguments) -> int:
+    """magjax fit."""
+    p = _common("fit", "Joint fit: all Preisach masses with R_eddy, xi and f0 (or what the bench frees) to all recordings.",
+                "magjax fit rec_*.csv --bench aa-050h --out result")  # fmt: skip
+    p.add_argument("--cells", type=int, help="fit one unknown a cell at this level instead of a smooth density")
+    options = p.parse_args(arguments)
+    prepare_jax()
+    from magjax.recording import load_recordings
+
+    bench, actuator = _bench_and_start(options)
+    folder = output_folder(options.out)
+    recordings = load_recordings(options.recordings, bench)
+    checks = load_recordings(options.check, bench) if options.check else []
+    from fitting.check import check_errors
+    from fitting.fit import fit
+    from fitting.setup import Choices
+
+    choices = Choices(max_jacobians=options.max_jacobians)
+    if options.cells:
+        choices = Choices(level=options.cells, knots=None, max_jacobians=options.max_jacobians)
+    held = tuple(f"effects.{e.name}.{q}" for e in (actuator.effects if actuator else ()) for q in e.parameters())
+    with Progress(options.quiet or options.json) as progress:
+        result = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
+    content = result.as_dict()
+    content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
+    if folder:
+        from fitting.report import write_fit
+
+        write_fit(folder, result, recordings, content, _reproduce("fit", arguments))
+    if options.json:
+        print(json.dumps(content))
+    else:
+        print(result)
+        for row in content["check"]:
+            print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g})")
+        if folder:
+            print(f"\nresults in {folder} (report.html, fit.json, model.json)")
+    return 0 if result.converged else 4
+
+
+def run_diagnose(arguments) -> int:
+    """magjax diagnose."""
+    p = _common("diagnose", "Say what physics the model leaves out: where, what, how much better with it, what to record next.",
+                "magjax diagnose rec_*.csv --bench aa-050h --check check_*.csv --out result")  # fmt: skip
+    options = p.parse_args(arguments)
+    prepare_jax()
+    from magjax.errors import RecordingError
+    from magjax.recording import load_recordings
+
+    bench, actuator = _bench_and_start(options)
+    folder = output_folder(options.out)
+    from fitting.diagnose import Diagnosis, diagnose
+    from fitting.setup import Choices
+
+    recordings = []
+    try:
+        recordings = load_recordings(options.recordings, bench)
+        checks = load_recordings(options.check, bench) if options.check else []
+        with Progress(options.quiet or options.json) as progress:
+            found = diagnose(recordings, bench, check=checks, actuator=actuator,
+                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress)  # fmt: skip
+    except RecordingError as error:
+        found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
+    content = found.as_dict()
+    if folder:
+        from fitting.report import write_diagnosis
+
+        write_diagnosis(folder, found, recordings, content, _reproduce("diagnose", arguments))
+    if options.json:
+        print(json.dumps(content))
+    else:
+        print(found)
+        for row in found.candidates[:8]:
+            print(f"  {row.name:26s} z = {row.z:8.1f}   visible from {row.smallest_visible:.3g}")
+        if folder:
+            print(f"\nresults in {folder} (report.html, diagnosis.json)")
+    return 3 if found.verdict == "data_problem" else 0
+
+
+def run_demo(arguments) -> int:
+    """magjax demo."""
+    p = parser("demo", "Invent a bench with concealed physics, record it with noise, fit it, diagnose it, write the report.", "magjax demo --out demo")
+    p.add_argument("--out", default="magjax-demo", help="folder for recordings and results (default magjax-demo)")
+    options = p.parse_args(arguments)
+    prepare_jax()
+    folder = output_folder(options.out)
+    from fitting.demo import run_demo as demo
+
+    with Progress(options.quiet or options.json) as progress:
+        text, content = demo(folder, options.seed, progress)
+    print(json.dumps(content) if options.json else text)
+    return 0
+
+
+def run_report(arguments) -> int:
+    """magjax report."""
+    p = parser("report", "Build report.html of a result folder again.", "magjax report result")
+    p.add_argument("folder", help="a folder that magjax fit or diagnose wrote")
+    options = p.parse_args(arguments)
+    from fitting.report import rebuild
+
+    page = rebuild(Path(options.folder))
+    print(json.dumps({"report": str(page)}) if options.json else f"wrote {page}", file=sys.stdout)
+    return 0

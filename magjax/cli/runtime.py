@@ -1,0 +1,83 @@
+"""What commands share: JAX set up once, common options, progress, output folders that are checked before the work."""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+from magjax.errors import ConfigurationError
+
+
+def prepare_jax() -> None:
+    """Double precision and a compilation cache that outlives the run."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    cache = Path(os.environ.get("MAGJAX_CACHE", Path.home() / ".cache" / "magjax"))
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    except OSError:
+        pass  # without a cache every run compiles anew; nothing else is lost
+
+
+class Parser(argparse.ArgumentParser):
+    """Wrong use is one line and exit status 2."""
+
+    def error(self, message):
+        """One line that names the command and the mend."""
+        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def parser(command: str, text: str, example: str) -> Parser:
+    """A parser with the common options."""
+    made = Parser(prog=f"magjax {command}", description=text, epilog=f"example: {example}", formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--json", action="store_true", help="print the result as JSON on stdout; progress goes to stderr")
+    made.add_argument("--quiet", action="store_true", help="no progress")
+    made.add_argument("--seed", type=int, default=0, help="seed of everything random (default 0)")
+    return made
+
+
+def output_folder(path) -> Path | None:
+    """A folder that can be written, made before the work starts."""
+    if path is None:
+        return None
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".magjax-write-test"
+        probe.write_text("")
+        probe.unlink()
+    except OSError as error:
+        raise ConfigurationError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
+    return folder
+
+
+class Progress:
+    """Progress on stderr by rich: a spinner with what is being done, silent when asked."""
+
+    def __init__(self, quiet: bool):
+        self.quiet = quiet
+        self.status = None
+
+    def __enter__(self):
+        if not self.quiet:
+            from rich.console import Console
+
+            self.status = Console(stderr=True).status("reading and compiling")
+            self.status.start()
+            self.begin = time.perf_counter()
+        return self
+
+    def __exit__(self, *_):
+        if self.status is not None:
+            self.status.stop()
+
+    def __call__(self, text, step=0, chi2=None):
+        """What is being done, at which step, with which misfit."""
+        if self.status is not None:
+            misfit = "" if chi2 is None else f", chi2/N = {chi2:.4g}"
+            self.status.update(f"{text}: step {step}{misfit} ({time.perf_counter() - self.begin:.0f} s)")

@@ -1,0 +1,108 @@
+"""Commands simulate and sweep."""
+
+import json
+
+import numpy as np
+
+from magjax.errors import ConfigurationError
+
+from .runtime import Progress, output_folder, parser, prepare_jax
+
+
+def run(command: str, arguments: list[str]) -> int:
+    """Run one of the commands of this module."""
+    return {"simulate": run_simulate, "sweep": run_sweep}[command](arguments)
+
+
+def _actuator(options):
+    if options.model:
+        from magjax.model_file import load_model
+
+        return load_model(options.model)
+    from magjax.bench import load_bench
+
+    bench = load_bench(options.bench or "aa-050h")
+    return bench.actuator(), bench
+
+
+def _target(path):
+    from pathlib import Path
+
+    path = Path(path)
+    output_folder(path.parent)
+    return path
+
+
+def _options(command, text, example):
+    p = parser(command, text, example)
+    p.add_argument("--bench", help="bench file (TOML) or a built-in name (default aa-050h)")
+    p.add_argument("--model", help="a fitted result folder")
+    return p
+
+
+def run_simulate(arguments) -> int:
+    """magjax simulate."""
+    p = _options("simulate", "Simulate the chain for a biased sine or for the drive of a file; every signal goes to NetCDF.",
+                 "magjax simulate --model result --frequency 50 --amplitude 0.8 --offset 0.1 --out run.nc")  # fmt: skip
+    p.add_argument("--drive", help="a recording whose drive is applied")
+    p.add_argument("--frequency", type=float, default=50.0, help="Hz")
+    p.add_argument("--amplitude", type=float, default=0.5, help="A")
+    p.add_argument("--offset", type=float, default=0.0, help="A")
+    p.add_argument("--samples", type=int, default=1000, help="samples a period")
+    p.add_argument("--out", default="simulation.nc", help="NetCDF file")
+    options = p.parse_args(arguments)
+    prepare_jax()
+    actuator, bench = _actuator(options)
+    path = _target(options.out)
+    from magjax.simulate import signals_dataset, simulate
+
+    if options.drive:
+        from magjax.recording import load_recordings
+
+        recording = load_recordings([options.drive], bench)[0]
+        drive, dt, periodic = recording.channels[bench.drive], recording.dt, recording.frequency() is not None
+    else:
+        if options.samples < 20 or not options.frequency > 0:
+            raise ConfigurationError("give --frequency above zero and --samples of 20 or more")
+        phase = 2 * np.pi * np.arange(options.samples) / options.samples
+        drive = options.offset + options.amplitude * np.sin(phase)
+        dt, periodic = 1 / (options.frequency * options.samples), True
+    with Progress(options.quiet or options.json):
+        signals = simulate(actuator, drive, dt, periodic=periodic)
+        data = signals_dataset(signals, bench.name)
+    data.to_netcdf(path, engine="h5netcdf")
+    stroke = float(np.ptp(np.asarray(signals.reading)))
+    print(json.dumps({"file": str(path), "peak_to_peak": stroke}) if options.json else f"peak to peak {stroke:.4g}; wrote {path}")
+    return 0
+
+
+def _values(text):
+    try:
+        if ":" in text:
+            low, high, count = text.split(":")
+            return np.linspace(float(low), float(high), int(count))
+        return np.asarray([float(v) for v in text.split(",")])
+    except ValueError:
+        raise ConfigurationError(f'"{text}" is no list of values; write 10,20,50 or 10:300:30 (low:high:count)') from None
+
+
+def run_sweep(arguments) -> int:
+    """magjax sweep."""
+    p = _options("sweep", "Steady states over frequencies x amplitudes x offsets, to NetCDF.",
+                 "magjax sweep --frequencies 10:300:30 --amplitudes 0.1:0.8:8 --out sweep.nc")  # fmt: skip
+    p.add_argument("--frequencies", default="10:300:30", help="Hz: a list or low:high:count")
+    p.add_argument("--amplitudes", default="0.2,0.5,0.8", help="A")
+    p.add_argument("--offsets", default="0", help="A")
+    p.add_argument("--out", default="sweep.nc", help="NetCDF file")
+    options = p.parse_args(arguments)
+    prepare_jax()
+    actuator, _ = _actuator(options)
+    path = _target(options.out)
+    from magjax.simulate import sweep
+
+    with Progress(options.quiet or options.json):
+        data = sweep(actuator, _values(options.frequencies), _values(options.amplitudes), _values(options.offsets))
+    data.to_netcdf(path, engine="h5netcdf")
+    count = int(np.prod(list(data.sizes.values())))
+    print(json.dumps({"file": str(path), "points": count}) if options.json else f"{count} steady states; wrote {path}")
+    return 0

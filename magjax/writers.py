@@ -1,0 +1,57 @@
+"""Recordings out: CSV, NetCDF, MATLAB, each whole or not at all."""
+
+from pathlib import Path
+
+import numpy as np
+
+from .errors import ConfigurationError
+
+NAMES = {
+    "current": "current_A", "field": "field_A_per_m", "displacement": "displacement_m", "flux_density": "flux_density_T",
+    "magnetization": "magnetization_A_per_m", "voltage": "voltage_V", "temperature": "temperature_degC",
+}  # fmt: skip
+UNITS = {
+    "current": "A", "field": "A/m", "displacement": "m", "flux_density": "T", "magnetization": "A/m", "voltage": "V", "temperature": "degC"
+}
+
+
+def write_recording(path, recording) -> None:
+    """Write a recording; the ending says how: .csv, .nc or .mat."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".part")
+    writer = {".csv": _csv, ".nc": _netcdf, ".mat": _mat}.get(path.suffix.lower())
+    if writer is None:
+        raise ConfigurationError(f"{path}: ending {path.suffix or '(none)'} is unknown; write .csv, .nc or .mat")
+    try:
+        writer(partial, recording)
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ConfigurationError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def _columns(recording):
+    return {"time_s": recording.time, **{NAMES.get(c, c): v for c, v in recording.channels.items()}}
+
+
+def _csv(path, recording):
+    columns = _columns(recording)
+    head = [f"# {k}: {v}" for k, v in recording.origin.get("metadata", {}).items()]
+    rows = np.stack(list(columns.values()), axis=1)
+    with open(path, "w", encoding="utf-8") as stream:
+        stream.write("\n".join([*head, ",".join(columns)]) + "\n")
+        np.savetxt(stream, rows, delimiter=",", fmt="%.12g")
+
+
+def _netcdf(path, recording):
+    import xarray as xr
+
+    data = {c: ("time", v, {"units": UNITS.get(c, "")}) for c, v in recording.channels.items()}
+    attrs = {k: v for k, v in recording.origin.get("metadata", {}).items() if isinstance(v, (int, float, str))}
+    xr.Dataset(data, coords={"time": ("time", recording.time, {"units": "s"})}, attrs=attrs).to_netcdf(path, engine="h5netcdf")
+
+
+def _mat(path, recording):
+    from scipy.io import savemat
+
+    savemat(path, _columns(recording), appendmat=False)

@@ -1,0 +1,34 @@
+"""Double precision, one thread for the small dense solves, a compilation cache shared by the run's workers."""
+
+import os
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+cache = Path(os.environ.get("MAGJAX_CACHE", Path(tempfile.gettempdir()) / "magjax-test-cache"))
+cache.mkdir(parents=True, exist_ok=True)
+jax.config.update("jax_compilation_cache_dir", str(cache))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def release_programs():
+    """Compiled programs of a module are dropped after it: each holds many memory mappings."""
+    yield
+    jax.clear_caches()
+
+
+@pytest.fixture(scope="session")
+def measured():
+    """The folder of measured recordings; tests skip where it is absent."""
+    if not DATA.is_dir():
+        pytest.skip(f"measured recordings are not at {DATA.name}/ beside the checkout")
+    return DATA

@@ -1,0 +1,66 @@
+"""One table over the whole catalogue: identity at null, gradients, batching, declared facts."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import magjax.effects as effects
+from magjax.chain import BLOCKS
+from magjax.effects import CATALOGUE, AbstractEffect
+from magjax.simulate import run_chain
+from tests.test_simulate import actuator, sine
+
+N = 160
+CURRENT = jnp.asarray(sine(N, 0.7))
+DT = 1 / (80 * N)
+named = pytest.mark.parametrize("kind", CATALOGUE, ids=lambda k: k.name)
+
+
+@eqx.filter_jit
+def reading(act, current=CURRENT):
+    return run_chain(act, current, DT, 2, 4, "trapezoid").reading
+
+
+def test_every_effect_is_in_the_catalogue():
+    defined = {v for v in vars(effects).values() if isinstance(v, type) and issubclass(v, AbstractEffect) and v is not AbstractEffect}
+    assert defined == set(CATALOGUE)
+    assert len({k.name for k in CATALOGUE}) == len(CATALOGUE) == 28
+
+
+@named
+def test_declares_what_the_documentation_needs(kind):
+    assert kind.block in BLOCKS and kind.law and kind.source and kind.signature
+    assert kind.parameters()[kind.amplitude].null == 0.0
+    assert kind.__doc__ and kind.__module__.endswith(kind.name)
+
+
+@named
+def test_null_gradient_and_batch(kind):
+    act = actuator(20)
+    extended = act.with_effect(kind())
+    base = np.asarray(reading(act))
+    # the same to the last bit but for the compiler's fused multiply-adds
+    assert np.abs(np.asarray(reading(extended)) - base).max() <= 2e-15 * np.abs(base).max()
+    name, scale = f"effects.{kind.name}.{kind.amplitude}", kind.parameters()[kind.amplitude].scale
+
+    def at(value):
+        return reading(extended.replace({name: value}))
+
+    value = 0.3 * scale
+    exact = np.asarray(eqx.filter_jit(lambda v: jax.jvp(at, (v,), (jnp.ones_like(v),))[1])(jnp.asarray(value)))
+    step = 1e-4 * scale
+    number = (np.asarray(at(value + step)) - np.asarray(at(value - step))) / (2 * step)
+    assert np.abs(number).max() > 0
+    assert np.abs(exact - number).max() < 2e-4 * np.abs(number).max()
+    both = jax.vmap(lambda c: reading(extended.replace({name: value}), c))(jnp.stack([CURRENT, 0.5 * CURRENT]))
+    assert np.asarray(both[1]) == pytest.approx(np.asarray(reading(extended.replace({name: value}), 0.5 * CURRENT)), abs=1e-16, rel=1e-9)
+
+
+def test_smooth_friction_approaches_coulomb():
+    from magjax.effects import CoulombFriction
+
+    act = actuator(20)
+    with_friction = [np.asarray(reading(act.with_effect(CoulombFriction(f=2e-7, v_s=v)))) for v in (1e-3, 1e-4, 1e-5)]
+    assert np.abs(with_friction[2] - with_friction[1]).mean() < 0.3 * np.abs(with_friction[1] - with_friction[0]).mean()

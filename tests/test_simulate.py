@@ -1,0 +1,135 @@
+"""The coupled step of (4) and the chain: oracle, order, gradients, steady state, bad input, sweep."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from magjax.actuator import Actuator
+from magjax.bench import load_bench
+from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics
+from magjax.errors import ConfigurationError
+from magjax.preisach import Preisach, gaussian_lorentzian_masses
+from magjax.simulate import run_chain, simulate, sweep
+from tests.oracle.slow import SlowPreisach, slow_trapezoid
+
+LOW, HIGH, M_S = -2500.0, 2.7e4, 7.87e5
+
+
+def actuator(L=25, **coil):
+    masses = gaussian_lorentzian_masses(L, LOW, HIGH, M_S / 2, 9000, 5000, 900, 1100)
+    return Actuator(Coil(**coil), Preisach(masses, LOW, HIGH, M_S / 2), Magnetostriction(), Mechanics())
+
+
+def sine(n, amplitude=0.8, offset=0.1):
+    return offset + amplitude * np.sin(2 * np.pi * np.arange(n) / n)
+
+
+def test_coupled_step_agrees_with_the_slow_one():
+    L = 6
+    masses = np.asarray(gaussian_lorentzian_masses(L, LOW, HIGH, M_S / 2, 9000, 5000, 900, 1100))
+    coil = Coil()
+    plain = Actuator(coil, Preisach(masses, LOW, HIGH, 0.0), Magnetostriction(), Mechanics())
+    rng = np.random.default_rng(1)
+    current = 0.1 + 0.7 * np.sin(np.cumsum(rng.uniform(0, 0.5, 80)))
+    c1 = 70.0 / (4e-7 * np.pi * 1300 * 2.83e-5)
+    H, M = slow_trapezoid(SlowPreisach(masses, LOW, HIGH), current, 1e-4, 1.54e4, 1.23e4, c1)
+    got = simulate(plain, current, 1e-4)
+    assert np.abs(np.asarray(got.field) - H).max() < 1e-8
+    assert np.abs(np.asarray(got.magnetization) - M).max() < 1e-13 * M_S * 10
+    assert np.abs(np.asarray(got.residual)).max() < 1e-8
+
+
+@pytest.mark.parametrize("scheme", ["trapezoid", "bdf2"])
+def test_second_order(scheme):
+    """Two halvings of the step: the order over a run from rest (kinks fall anywhere between samples, so it scatters)."""
+    act = actuator()
+
+    def run(n):
+        t = np.arange(n + 1) / n
+        current = 0.1 + 0.7 * np.sin(2 * np.pi * t) * np.minimum(t * 4, 1) ** 2
+        return np.asarray(simulate(act, current, 1 / (100 * n), scheme=scheme).magnetization)
+
+    best = run(12800)
+    errors = [np.sqrt(np.mean((run(n) - best[:: 12800 // n]) ** 2)) for n in (200, 400, 800)]
+    order = np.log2(errors[0] / errors[2]) / 2
+    assert 1.7 < order < 2.8
+
+
+@pytest.mark.parametrize("name", ["coil.R_eddy", "coil.c0", "coil.H_bias", "mechanics.f0", "mechanics.xi", "magnetostriction.lambda_s", "sensor.offset"])
+def test_gradient_in_every_parameter(name):
+    act = actuator()
+    current = jnp.asarray(sine(120, 0.7))
+    weight = jnp.cos(jnp.arange(120.0))
+
+    @eqx.filter_jit
+    def functional(value):
+        return 1e6 * jnp.sum(weight * run_chain(act.replace({name: value}), current, 1 / 12000, 2, 4, "trapezoid").reading)
+
+    value = float(act.parameters()[name][0])
+    scale = max(abs(value), 1e-6)
+    exact = float(jax.jvp(functional, (jnp.asarray(value),), (jnp.asarray(1.0),))[1]) * scale
+    backward = float(jax.grad(functional)(jnp.asarray(value))) * scale
+    step = 3e-7
+    number = float(functional(jnp.asarray(value + step * scale)) - functional(jnp.asarray(value - step * scale))) / (2 * step)
+    assert exact == pytest.approx(number, rel=2e-6)
+    assert backward == pytest.approx(exact, rel=1e-9)
+
+
+def test_gradient_in_the_masses():
+    act = actuator(8)
+    current = jnp.asarray(sine(100, 0.7))
+
+    @eqx.filter_jit
+    def functional(m):
+        changed = eqx.tree_at(lambda a: a.hysteresis.masses, act, m)
+        return 1e6 * jnp.sum(jnp.sin(jnp.arange(100.0)) * run_chain(changed, current, 1e-4, 2, 4, "trapezoid").reading)
+
+    m = np.asarray(act.hysteresis.masses)
+    exact = np.asarray(jax.grad(functional)(jnp.asarray(m)))
+    for i, j in ((2, 1), (4, 4), (5, 2)):
+        step = 1e-4 * m.max()
+        change = np.zeros_like(m)
+        change[i, j] = step
+        number = float(functional(jnp.asarray(m + change)) - functional(jnp.asarray(m - change))) / (2 * step)
+        assert exact[i, j] == pytest.approx(number, rel=1e-6, abs=1e-8 * np.abs(exact).max())
+
+
+def test_periodic_is_the_settled_transient():
+    act = actuator()
+    n = 400
+    steady = simulate(act, sine(n), 1 / (50 * n), periodic=True, settle=4)
+    long = simulate(act, np.tile(sine(n), 6), 1 / (50 * n))
+    assert np.asarray(long.displacement)[-n:] == pytest.approx(np.asarray(steady.displacement), abs=1e-8)
+
+
+def test_static_limit_without_eddy_currents():
+    masses = gaussian_lorentzian_masses(20, -300, 300, 1e6, 0, 100, 50, 60)
+    act = Actuator(FieldCoil(), Preisach(masses, -300, 300, 0.0), output="flux_density")
+    field = 250 * np.sin(2 * np.pi * np.arange(200) / 200)
+    got = simulate(act, field, 1e-3, periodic=True)
+    assert np.asarray(got.field) == pytest.approx(field, abs=1e-9)
+    assert np.ptp(np.asarray(got.reading)) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("drive", "dt", "word"),
+    [([0.0, np.nan] * 20, 1e-3, "NaN"), (np.ones((2, 2)), 1e-3, "one row"), (np.zeros(30), -1.0, "positive"), (5 * np.sin(np.arange(100) / 5), 1e-3, "outside")],
+)
+def test_bad_drive_says_the_mend(drive, dt, word):
+    with pytest.raises(ConfigurationError, match=word):
+        simulate(actuator(), drive, dt)
+
+
+def test_sweep_equals_single_runs_and_does_not_depend_on_chunks():
+    act = load_bench("aa-050h").actuator()
+    grid = dict(frequencies=[10.0, 120.0], amplitudes=[0.3, 0.8], offsets=[0.0])
+    one = sweep(act, **grid, chunk=4)
+    parts = sweep(act, **grid, chunk=3)
+    assert np.allclose(one.peak_to_peak, parts.peak_to_peak, rtol=1e-12)
+    n = 250
+    alone = simulate(act, 0.8 * np.sin(2 * np.pi * np.arange(n) / n), 1 / (120 * n), periodic=True, settle=2)
+    assert float(one.peak_to_peak.sel(frequency=120, amplitude=0.8).item()) == pytest.approx(float(np.ptp(np.asarray(alone.reading))), rel=1e-10)
+    assert float(one.loss.min()) > 0
+    assert one.peak_to_peak.attrs["units"] == "m"

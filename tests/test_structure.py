@@ -1,0 +1,50 @@
+"""Discipline: who imports whom, what stays free of JAX, what stays fast, what stays documented."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+NUMPY_ONLY = ("magjax/inverse", "magjax/recording.py", "magjax/readers.py", "magjax/writers.py", "magjax/inspection.py", "magjax/waveforms.py", "magjax/bench.py")
+SOURCES = sorted([*ROOT.glob("magjax/**/*.py"), *ROOT.glob("fitting/**/*.py")])
+
+
+def imported(tree, everywhere=True):
+    for node in ast.walk(tree) if everywhere else tree.body:
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_one_way(path):
+    name, tree = str(path.relative_to(ROOT)), ast.parse(path.read_text())
+    modules = {m.split(".")[0] for m in imported(tree)}
+    if name.startswith("magjax/") and "cli" not in name:
+        assert "fitting" not in modules
+    if name.startswith(NUMPY_ONLY):
+        assert not modules & {"jax", "equinox", "optimistix", "lineax"}
+    assert "tests" not in modules
+
+
+def test_oracle_shares_no_code():
+    for path in [*ROOT.glob("tests/oracle/*.py")]:
+        assert not {m.split(".")[0] for m in imported(ast.parse(path.read_text()))} & {"magjax", "fitting"}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_public_things_are_documented(path):
+    tree = ast.parse(path.read_text())
+    assert ast.get_docstring(tree)
+    for node in tree.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            assert ast.get_docstring(node), f"{node.name} has no docstring"
+
+
+def test_the_command_line_starts_without_jax():
+    code = "import sys; from magjax.cli import main; main(['--help']); assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
