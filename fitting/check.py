@@ -6,7 +6,7 @@ from magjax.preisach.memory import nesting
 from magjax.simulate import simulate
 
 from .model import Predictor
-from .spectra import estimate_noise, evaluate_lines, reduce_recording
+from .spectra import evaluate_lines, reduce_recording
 
 
 def prediction(actuator, recording, bench):
@@ -23,7 +23,7 @@ def prediction(actuator, recording, bench):
     measured = measured[: s.samples]
     if bench.output == "flux_density":
         measured = measured - measured.mean() + predicted.mean()
-    return predicted, measured, estimate_noise([s]).rms
+    return predicted, measured, s.noise_rms
 
 
 def check_errors(before, after, recordings, bench) -> list[dict]:

@@ -41,8 +41,11 @@ class DensityBasis:
         return (self.total * (self.cells @ np.asarray(x))).reshape(self.size, self.size)
 
 
-def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: int = 18, knots_r: int = 13) -> DensityBasis:
-    """Bilinear hats for fields between `low` and `high` (A/m) at level `level`, and the once-switching column."""
+def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: int = 18, knots_r: int = 13, crowd: float = 1.0) -> DensityBasis:
+    """Bilinear hats for fields between `low` and `high` (A/m) at level `level`, and the once-switching column.
+
+    `crowd` > 1 gathers the knots in the middle of the plane, where soft materials switch.
+    """
     step = (high - low) / level
     size, refine = level + 1, 4
     points = low + step * (np.arange(level * refine) + 0.5) / refine
@@ -51,8 +54,9 @@ def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: i
     weight = np.where(inside, 1.0, 0.0)
     weight[np.diag_indices(len(points))] = 0.5
     s, r = 0.5 * (alpha + beta), 0.5 * (alpha - beta)
-    s_knots = np.linspace(low, high, knots_s)
-    r_knots = 0.5 * (high - low) * np.linspace(0, 1, knots_r) ** R_EXPONENT
+    even = np.linspace(-1, 1, knots_s)
+    s_knots = 0.5 * (low + high) + 0.5 * (high - low) * np.sign(even) * np.abs(even) ** crowd
+    r_knots = 0.5 * (high - low) * np.linspace(0, 1, knots_r) ** (R_EXPONENT * crowd**0.5)
     hats_s, hats_r = _hats(s[inside], s_knots), _hats(r[inside], r_knots)
     row, column = (k[inside] // refine for k in np.indices(s.shape))
     cell = (row + 1) * size + (column + 1)

@@ -23,7 +23,8 @@ from .setup import Choices
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 Z_THRESHOLD = 5.5  # about forty columns are looked at
 RECORD_Z = 8.0
-FULL_SHARE = 0.8
+FULL_SHARE = 0.93
+FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 MAX_EFFECTS = 3
 ABSORBED_VISIBILITY = 0.004
 
@@ -80,17 +81,17 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
     recordings = list(recordings)
     held = tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
     base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
-    problem = data_problem(recordings, base.spectra, base.problem.noise, bench.output) or wrong_bench(base)
+    problem = data_problem(recordings, base.spectra, bench.output) or wrong_bench(base)
     if problem:
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
     say("between the harmonics", 0, base.chi2_per_sample)
     adopted, recordings, base_now = _record_level(recordings, bench, base, choices, progress)
     candidates = screen(base_now.problem, base_now.refined)
-    noise = base_now.problem.noise
+    noise = base_now.problem.noise_rms
     floors = {
-        "noise_rms": noise.rms,
+        "noise_rms": noise,
         "solver_rms": solver_floor(base_now.problem, base_now.solution),
-        "density_rms": float(noise.rms * np.sqrt(max(base_now.chi2_per_sample - 1, 0) / max(np.median([s.samples for s in base.spectra]), 1))),
+        "density_rms": float(noise * np.sqrt(max(base_now.chi2_per_sample - 1, 0) / max(np.median([s.samples for s in base.spectra]), 1))),
     }
     place = where(base_now, candidates, recordings, bench.output)
     absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY)
@@ -102,8 +103,8 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
 def _record_level(recordings, bench, base, choices, progress):
     """Drift, heat and hum: adopted one by one, taken out of the readings, the base fitted again."""
     adopted, current = [], base
-    for _ in range(2):
-        found = record_effects(recordings, current.spectra, current.problem.noise)
+    for _ in range(0 if base.problem.quasistatic or bench.output != "displacement" else 2):
+        found = record_effects(recordings, current.spectra)
         best = found[0]
         if abs(best.z) < RECORD_Z:
             break
@@ -199,7 +200,7 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     count = base_now.data_count
     missing = excess > SILENT_CHI2 + 3 * np.sqrt(2 / count)
     share = 1 - max(excess - 1, 0) / max(base_now.chi2_per_sample - 1, 1e-9) if base_now.chi2_per_sample > SILENT_CHI2 else 1.0
-    if missing and (not state.steps or share < FULL_SHARE):
+    if missing and (not state.steps or share < FULL_SHARE or excess > FAR_FROM_NOISE):
         return _unknown(state, share, excess, common)
     if not effects and not groups:
         smallest = min((c.smallest_visible for c in candidates if c.visibility > 0.05), default=None)
@@ -211,7 +212,7 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
         return Diagnosis("nothing_missing", text, **common)
     better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
     if groups:
-        experiment = next_experiment(last_rivals, base.spectra, bench, base_now.problem.noise.rms) if last_rivals else None
+        experiment = next_experiment(last_rivals, base.spectra, bench, base_now.problem.noise_rms) if last_rivals else None
         names = "; ".join(" or ".join(g) for g in groups)
         text = f"something is missing that these recordings cannot tell apart: {names}."
         if effects:
@@ -220,7 +221,7 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
             text += f" Next: {experiment['text']}."
         return Diagnosis("group", text, tuple(effects), tuple(groups), next_experiment=experiment, **common)
     named = " and ".join(f"{e['name']} ({e['block']})" for e in effects)
-    text = f"{named} was left out: chi2/N falls from {base.chi2_per_sample:.3g} to {excess:.2f}."
+    text = f"{named} {'was' if len(effects) == 1 else 'were'} left out: chi2/N falls from {base.chi2_per_sample:.3g} to {excess:.2f}."
     text += f" On check recordings: {better}." if better else " Record a check at another frequency to confirm it."
     return Diagnosis("attributed", text, tuple(effects), **common)
 

@@ -12,7 +12,6 @@ from magjax.simulate import require_x64
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
 from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
-from .spectra import estimate_noise
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 FINER_KNOTS = ((26, 18), (36, 24))
@@ -32,26 +31,25 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     actuator = bench.actuator() if actuator is None else actuator
     begin = time.perf_counter()
     spectra = spectra_of(recordings, bench, choices.harmonics)
-    noise = estimate_noise(spectra)
     names = free_parameters(bench, actuator, extra)
     report = (lambda *a: None) if progress is None else progress
-    problem, z = build_problem(spectra, noise, actuator, bench, names, choices, start)
+    problem, z = build_problem(spectra, actuator, bench, names, choices, start)
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
     solution = solve(problem, z, START_WEIGHTS, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
     if refine and choices.knots is not None:
-        problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, noise, report)
+        problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report)
     return finish(problem, solution, choices, bench, recordings, warm)
 
 
-def _refine_density(problem, solution, actuator, bench, names, choices, spectra, noise, report):
+def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report):
     """Finer hats where chi2 stays above the noise and they lower it clearly."""
     count = problem.data_count
     for knots in FINER_KNOTS:
         if not REFINE_BETWEEN[0] < solution.chi2 / count < REFINE_BETWEEN[1]:
             break
         finer = dataclasses.replace(choices, knots=knots, level=max(choices.level, 4 * knots[0]))
-        started = _resample(problem, solution, spectra, noise, actuator, bench, names, finer)
+        started = _resample(problem, solution, spectra, actuator, bench, names, finer)
         trial_problem, z = started
         z = _with_parameters(trial_problem, z, problem, solution)
         trial = solve(trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("finer density", k, c))
@@ -70,10 +68,10 @@ def _with_parameters(new_problem, z, problem, solution):
     return z
 
 
-def _resample(problem, solution, spectra, noise, actuator, bench, names, choices):
+def _resample(problem, solution, spectra, actuator, bench, names, choices):
     """A problem on finer hats, started from the fitted parameters and the equation error under them."""
     values = {n: float(problem.layout.value(n, jnp.asarray(solution.z))) for n in names}
-    return build_problem(spectra, noise, actuator.replace(values), bench, names, choices)
+    return build_problem(spectra, actuator.replace(values), bench, names, choices)
 
 
 def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult:
@@ -117,7 +115,7 @@ def recording_fits(problem, residual, recordings, bench):
             RecordingFit(
                 recording.origin.get("file", recording.name) if "[" not in recording.name else recording.name,
                 recording.origin.get("sha256", ""), bench.output, {"displacement": "m", "flux_density": "T"}.get(bench.output, "A/m"),
-                s.frequency, s.periods, problem.noise.rms, float(np.sqrt(power.sum() + between)), chi2 / number,
+                s.frequency, s.periods, s.noise_rms, float(np.sqrt(power.sum() + between)), chi2 / number,
             )
         )  # fmt: skip
     return tuple(rows)

@@ -49,13 +49,13 @@ def record_columns(recordings, spectra):
     return rows
 
 
-def record_effects(recordings, spectra, noise) -> list[RecordEffect]:
+def record_effects(recordings, spectra) -> list[RecordEffect]:
     """Drift, heat and hum scored on what the harmonics leave, best first."""
     found = {}
     for name, shapes, columns in record_columns(recordings, spectra):
         top, bottom = 0.0, 0.0
         for s, column in zip(spectra, columns, strict=True):
-            weight, r, c = _between(s, column, noise)
+            weight, r, c = _between(s, column)
             top += float(np.sum(weight * (np.conj(c) * r).real))
             bottom += float(np.sum(weight * np.abs(c) ** 2))
         z, amplitude = top / np.sqrt(bottom), top / bottom
@@ -67,10 +67,10 @@ def record_effects(recordings, spectra, noise) -> list[RecordEffect]:
         for s in spectra:
             t = s.dt * np.arange(s.samples)
             parts = [np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]
-            reduced = [_between(s, p, noise) for p in parts]
+            reduced = [_between(s, p) for p in parts]
             G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
             g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
-            if np.trace(G) < 1e-3 * s.samples / max(noise.white, 1e-300):
+            if np.trace(G) < 1e-3 * s.samples / max(s.noise_rms**2, 1e-300):
                 fits.append(np.zeros(s.samples))
                 continue
             best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(2), g)
@@ -84,12 +84,12 @@ def record_effects(recordings, spectra, noise) -> list[RecordEffect]:
     return sorted(found.values(), key=lambda e: -abs(e.z))
 
 
-def _between(s, column, noise):
+def _between(s, column):
     """Weights, residue and column in the frequency domain, both without the harmonics."""
     phases = np.arange(s.samples) * s.dt * s.frequency
     left = fit_lines(np.asarray(column, float), phases, len(s.reading) - 1)[1]
     f = np.fft.rfftfreq(s.samples, s.dt)
-    weight = 2.0 / (s.samples * noise.density(np.maximum(f, f[1])))
+    weight = 2.0 / (s.samples * s.noise.density(np.maximum(f, f[1])))
     weight[0] = 0.0
     return weight, np.fft.rfft(s.residue), np.fft.rfft(left)
 
@@ -110,7 +110,7 @@ def remove_record_effect(recordings, effect, output):
     return cleaned
 
 
-def data_problem(recordings, spectra, noise, output) -> str | None:
+def data_problem(recordings, spectra, output) -> str | None:
     """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
     for recording, s in zip(recordings, spectra, strict=True):
         y = np.asarray(recording.channels[output])[: s.samples]
@@ -119,7 +119,7 @@ def data_problem(recordings, spectra, noise, output) -> str | None:
             blocks = y[: step * s.periods].reshape(s.periods, step)
             first = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))
             later = float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if s.periods > 2 else 0.0
-            floor = np.sqrt(2 * noise.white)
+            floor = np.sqrt(2 * s.noise.white)
             if first > 0.03 * s.peak_to_peak and first > 8 * floor and first > 4 * later:
                 return (
                     f"{recording.name}: the first period differs from the last by {first:.3g} rms and later ones do not: an unsettled "

@@ -26,7 +26,12 @@ class Problem:
     predictors: tuple[Predictor, Predictor]
     target: Target
     spectra: tuple
-    noise: object
+    quasistatic: bool = False  # the time axis is made up: nothing that depends on a rate may be claimed
+
+    @property
+    def noise_rms(self) -> float:
+        """Typical noise of the reading, rms, its unit."""
+        return float(np.median([s.noise_rms for s in self.spectra]))
 
     @property
     def data_count(self) -> int:
@@ -121,7 +126,7 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
     bounded = jnp.asarray(layout.nonnegative)
     z, weights = np.asarray(z, float), np.asarray(weights, float)
     prior = prior_matrix(problem, weights)
-    begin, converged, taken, damping, decrement = time.perf_counter(), False, 0, 1e-2, np.inf
+    begin, converged, taken, damping, decrement, held = time.perf_counter(), False, 0, 1e-2, np.inf, np.inf
     residual = data_residual(problem, z)
     chi2 = float(residual @ residual)
     cost = 0.5 * (chi2 + z @ prior @ z)
@@ -135,7 +140,7 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
                 new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounded))
                 trial = data_residual(problem, new)
                 new_cost = 0.5 * float(trial @ trial + new @ prior @ new)
-                ratio = (cost - new_cost) / max(float(predicted), 1e-300)
+                ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0
                 good = bool(np.isfinite(new_cost) and ratio > 1e-3)
                 damping = max(damping * (0.15 if ratio > 0.5 else 1.0 if good else 6.0), 1e-9)
                 if good or float(predicted) < 1e-6 * cost + 1e-3:
@@ -154,6 +159,12 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
                 prior = prior_matrix(problem, weights)
                 cost = 0.5 * (chi2 + z @ prior @ z)
                 settled = settled and moved < 0.3
+            elif evidence and settled:
+                # settled far above the noise: as long as the prior, not the physics, holds it there, let go
+                if chi2 < 0.8 * held and weights.max() > 10 * WEIGHT_RANGE[0]:
+                    held, weights, settled = chi2, np.maximum(weights / 30, WEIGHT_RANGE[0]), False
+                    prior = prior_matrix(problem, weights)
+                    cost = 0.5 * (chi2 + z @ prior @ z)
             if settled or not good:
                 converged = decrement < 1.0 + 1e-3 * cost
                 if settled or not evidence or decrement < 1.0:

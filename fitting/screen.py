@@ -63,16 +63,29 @@ def shape_grid(effect_class):
     return grid
 
 
-def applicable(actuator):
-    """Effects of the catalogue whose block this actuator has, and that it does not hold already."""
+RATE_FREE = ("mean_field", "reversible_magnetization", "accommodation", "quartic_magnetostriction", "linear_strain", "strain_hysteresis", "sensor_nonlinearity")
+
+
+def applicable(actuator, quasistatic: bool = False):
+    """Effects of the catalogue whose block this actuator has, and that it does not hold already.
+
+    `quasistatic`: without a time axis only rate-independent effects can be asked for.
+    """
     held = {e.name for e in actuator.effects}
     found = []
     for effect in CATALOGUE:
-        if effect.name in held:
+        if effect.name in held or (quasistatic and effect.name not in RATE_FREE):
             continue
         if effect.block in ("magnetostriction", "mechanics") and getattr(actuator, effect.block) is None:
             continue
-        if effect.name in ("stress_feedback",) and actuator.mechanics is None:
+        if effect.name == "stress_feedback" and actuator.mechanics is None:
+            continue
+        lossy = float(np.asarray(actuator.coil.loss)) > 0
+        if effect.name == "eddy_currents" and lossy:  # the base has them: R_eddy or k_eddy
+            continue
+        if effect.name in ("field_diffusion", "second_eddy_path") and not lossy:  # they scale with what is not there
+            continue
+        if actuator.output != "displacement" and effect.name == "linear_strain":
             continue
         found.append(effect)
     return found
@@ -160,7 +173,7 @@ def columns(problem, z):
     """First-order change of the whitened misfit by every applicable effect: list of (class, shapes, column)."""
     actuator = problem.layout.actuator(problem.template, jnp.asarray(z))
     predictor = problem.predictors[0]
-    classes = [c for c in applicable(actuator) if not c.record_level]
+    classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
     found = []
     late = [(c, shapes) for c in classes if not c.in_step and c.block != "source" for shapes in shape_grid(c)]
     states = _steady_state(predictor, actuator)

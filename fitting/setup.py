@@ -14,8 +14,8 @@ from .density import cell_basis, hat_basis
 from .joint import Problem
 from .model import Layout, Predictor, Target, make_start_actuator
 from .solver import bounded_step
-from .spectra import HARMONICS, estimate_noise, line_deviations, reduce_recording
-from .starts import equation_error_start
+from .spectra import HARMONICS, line_deviations, reduce_recording, with_noise
+from .starts import equation_error_start, scan_loss
 
 START_WEIGHTS = (1e2, 1e2, 1e2)
 PLANE_MARGIN = 0.01
@@ -46,7 +46,7 @@ def spectra_of(recordings, bench, harmonics: int = HARMONICS):
                 "give this recording with --check instead"
             )
         spectra.append(reduce_recording(recording, bench.drive, bench.output, harmonics))
-    return tuple(spectra)
+    return with_noise(spectra)
 
 
 def applied_range(spectra, actuator):
@@ -71,7 +71,7 @@ def effect_parameters(effect, actuator):
     return tuple(f"effects.{effect.name}.{p}" for p in parameters_of(effect))
 
 
-def build_problem(spectra, noise, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
+def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
     """The problem and its starting vector. `start`: density unknowns and bottom to reuse, else equation error."""
     low, high = applied_range(spectra, actuator)
     margin = PLANE_MARGIN * (high - low)
@@ -79,12 +79,18 @@ def build_problem(spectra, noise, actuator, bench, names, choices: Choices, star
     if choices.knots is None:
         basis = cell_basis(low - margin, high + margin, total, choices.level)
     else:
-        basis = hat_basis(low - margin, high + margin, total, choices.level, *choices.knots)
+        crowd = 1.7 if bench.drive == "field" else 1.0
+        level = 2 * choices.level if bench.drive == "field" else choices.level
+        basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd)
     harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
-    deviations = [line_deviations(s, noise)[: harmonics + 1] for s in spectra]
+    deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
+    if "coil.k_eddy" in names:  # field-driven benches differ by decades: find the scale first
+        full = [line_deviations(s, s.noise) for s in spectra]
+        found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
+        actuator = actuator.replace({"coil.k_eddy": found})
     if start is None:
-        full = [line_deviations(s, noise) for s in spectra]
-        x, bottom = equation_error_start(basis, spectra, full, actuator, jax.jit(bounded_step))
+        full = [line_deviations(s, s.noise) for s in spectra]
+        x, bottom, _ = equation_error_start(basis, spectra, full, actuator, jax.jit(bounded_step))
         start = np.append(x, bottom)
     known = actuator.parameters()
     values = [float(known[n][0]) for n in names]
@@ -101,8 +107,12 @@ def build_problem(spectra, noise, actuator, bench, names, choices: Choices, star
         deviations[:, 0] = np.inf
     priors = np.asarray([_prior(bench, *row) for row in zip(names, values, log, infos, strict=True)])
     target = Target(jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS), jnp.asarray(priors), jnp.asarray(1e-3))
-    problem = Problem(layout, make_start_actuator(actuator, basis), predictors, target, tuple(spectra), noise)
+    problem = Problem(layout, make_start_actuator(actuator, basis), predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names))])
+
+
+def _quasistatic(bench) -> bool:
+    return bool(bench.columns.get("time", {}).get("quasistatic"))
 
 
 def _prior(bench, name, value, is_log, info):
@@ -119,10 +129,3 @@ def _total_from(spectra, bench):
     """Scale of the masses where no M_s is stated: from the largest reading."""
     largest = max(s.peak_to_peak for s in spectra)
     return largest / (4e-7 * np.pi) if bench.output == "flux_density" else largest
-
-
-def prepare(recordings, bench, actuator, names, choices: Choices = Choices()):
-    """Spectra, noise, problem and start in one call."""
-    spectra = spectra_of(recordings, bench, choices.harmonics)
-    noise = estimate_noise(spectra)
-    return build_problem(spectra, noise, actuator, bench, names, choices)

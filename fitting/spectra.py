@@ -2,7 +2,7 @@
 
 A record of whole periods is reduced to its reading at the harmonics 0..H of the fundamental (least squares, so that
 periods need not divide the sampling), its drive to the significant lines, and everything else to a noise spectrum
-S(f) = white + flicker/f, estimated from the bins between the harmonics and pooled over recordings.
+S(f) = white + flicker/f (or /f^2), estimated from the bins between the harmonics and pooled over recordings.
 """
 
 import dataclasses
@@ -36,6 +36,13 @@ class Spectrum:
     peak_to_peak: float
     drive_noise: float
     given_noise: float | None = None
+    noise: object = None
+
+    @property
+    def noise_rms(self) -> float:
+        """Rms of what lies between the harmonics, unit of the reading."""
+        scale = self.samples / max(self.samples - 2 * len(self.reading), 1)
+        return float(np.sqrt(np.mean(self.residue**2) * scale))
 
     def drive_at(self, phases: np.ndarray) -> np.ndarray:
         """The drive at phases (cycles) of one period."""
@@ -112,18 +119,19 @@ def significant_lines(lines: np.ndarray, residue: np.ndarray, periods: int):
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """S(f) = white + flicker / f: variance of a sample at each, unit^2 (and unit^2 Hz)."""
+    """S(f) = white + flicker / f^slope: variance a sample, unit^2; slope 1, or 2 for an integrated channel."""
 
     white: float
     flicker: float
+    slope: int = 1
 
     def density(self, f):
-        """Variance per sample of noise at frequency f (Hz); the mean takes the value of `lowest`."""
-        return self.white + self.flicker / np.maximum(f, 1e-9)
+        """Variance per sample of noise at frequency f, Hz."""
+        return self.white + self.flicker / np.maximum(f, 1e-9) ** self.slope
 
     @property
     def rms(self) -> float:
-        """White noise, rms."""
+        """White part, rms."""
         return float(np.sqrt(self.white))
 
 
@@ -137,18 +145,36 @@ def estimate_noise(spectra, quantum: float = 0.0) -> Noise:
         return Noise(float(white), 0.0)
     white0 = max(np.median(power) / np.log(2), 1e-300)
     f0 = float(np.median(f))
+    flat = float(np.mean(power))
+    best, likelihood = Noise(flat, 0.0), np.log(flat) + 1.0
+    for slope in (1, 2):
 
-    def whittle(theta):
-        S = np.exp(theta[0]) + np.exp(theta[1]) * f0 / f
-        r = power / white0
-        return np.mean(np.log(S) + r / S)
+        def whittle(theta, slope=slope):
+            S = white0 * (np.exp(theta[0]) + np.exp(theta[1]) * (f0 / f) ** slope)
+            return np.mean(np.log(S) + power / S)
 
-    best = minimize(whittle, [0.0, -4.0], method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-7, "maxiter": 400})
-    white, flicker = np.exp(best.x[0]) * white0, np.exp(best.x[1]) * white0 * f0
-    gain = np.mean(np.log(white0 * 1.0) + power / white0) - np.mean(np.log(white + flicker / f) + power / (white + flicker / f))
-    if gain * len(f) < 4:  # the flicker does not earn its place
-        white, flicker = float(np.mean(power)), 0.0
-    return Noise(max(float(white), quantum**2 / 12), float(flicker))
+        for start in ([0.0, -4.0], [-3.0, 0.0]):
+            found = minimize(whittle, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-7, "maxiter": 400})
+            if (likelihood - found.fun) * len(f) > 4:  # the colour earns its place
+                white, flicker = np.exp(found.x) * white0
+                best, likelihood = Noise(float(white), float(flicker * f0**slope), slope), found.fun
+    return dataclasses.replace(best, white=max(best.white, quantum**2 / 12))
+
+
+def with_noise(spectra) -> tuple:
+    """The spectra with their noise: pooled, or each its own where the bins between the harmonics say that they differ."""
+    pooled = estimate_noise(spectra)
+    own = []
+    gain = 0.0
+    for s in spectra:
+        if len(s.between_f) < 40:
+            return tuple(dataclasses.replace(x, noise=pooled) for x in spectra)
+        mine = estimate_noise([s])
+        own.append(mine)
+        a, b = pooled.density(s.between_f), mine.density(s.between_f)
+        gain += float(np.sum(np.log(a) + s.between_power / a - np.log(b) - s.between_power / b))
+    differ = gain > 40 * len(spectra)
+    return tuple(dataclasses.replace(s, noise=n if differ else pooled) for s, n in zip(spectra, own, strict=True))
 
 
 def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:

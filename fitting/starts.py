@@ -113,7 +113,10 @@ def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
 
 
 def equation_error_start(basis, spectra, deviations, actuator, solve, max_frequency=None):
-    """Density unknowns and the bottom of M from the slower half of the recordings: (x, bottom / total)."""
+    """Density unknowns and the bottom of M from the slower half of the recordings: (x, bottom / total, misfit).
+
+    `max_frequency`: take all recordings (any value but None). `misfit`: rms of the weighted equation error, relative.
+    """
     order = np.argsort([s.frequency for s in spectra])
     chosen = order[: max(2, (len(order) + 1) // 2)] if max_frequency is None else order
     spectra = [spectra[k] for k in chosen]
@@ -133,4 +136,11 @@ def equation_error_start(basis, spectra, deviations, actuator, solve, max_freque
         normal[:n, :n] += weight * D.T @ D
     normal += 1e-8 * np.trace(normal) / len(normal) * np.eye(n + 1)
     solution = np.asarray(solve(normal, gradient, np.zeros(n + 1), np.arange(n + 1) < n))
-    return np.maximum(solution[:n], 0.0), float(solution[n])
+    misfit = float(np.sqrt(np.mean((A @ solution - b) ** 2)))
+    return np.maximum(solution[:n], 0.0), float(solution[n]), misfit
+
+
+def scan_loss(basis, spectra, deviations, actuator, solve, name, values):
+    """The value of the coil's loss parameter under which all loops are best met by one density: no simulation."""
+    misfits = [equation_error_start(basis, spectra, deviations, actuator.replace({name: v}), solve, np.inf)[2] for v in values]
+    return float(values[int(np.argmin(misfits))])

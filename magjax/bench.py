@@ -22,7 +22,7 @@ OTHER_KEYS = {
     "limits": ("current_A", "field_A_per_m"),
     "fit": ("free", "output", "priors"),
 }
-COLUMN_KEYS = ("name", "scale", "offset", "unit", "split", "quasistatic", "emf_turns", "emf_area", "emf_sign")
+COLUMN_KEYS = ("name", "scale", "offset", "unit", "split", "merge", "quasistatic", "emf_turns", "emf_area", "emf_sign")
 QUANTITIES = ("time", "current", "field", "displacement", "flux_density", "magnetization", "voltage", "temperature")
 STARTS = ("auto", "demagnetized", "negative_saturation", "positive_saturation")
 

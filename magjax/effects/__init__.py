@@ -9,6 +9,7 @@ from .coulomb_friction import CoulombFriction
 from .creep import Creep
 from .delta_e import DeltaE
 from .duffing_stiffness import DuffingStiffness
+from .eddy_currents import EddyCurrents
 from .excess_loss import ExcessLoss
 from .field_diffusion import FieldDiffusion
 from .inductive_crosstalk import InductiveCrosstalk
@@ -33,6 +34,7 @@ from .zero_drift import ZeroDrift
 CATALOGUE = (
     AmplifierLag,
     AmplifierClipping,
+    EddyCurrents,
     ExcessLoss,
     FieldDiffusion,
     SecondEddyPath,

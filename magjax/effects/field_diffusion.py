@@ -14,7 +14,7 @@ RATES = (1.0, 5.27, 12.95, 30.0)  # (j0n/j01)^2
 class FieldDiffusion(AbstractEffect):
     """Skin effect of a cylinder: k dB/dt becomes a ladder of lags with the same total lag at low frequency."""
 
-    kappa: Float[Array, ""] = param(0.0, "1", "share of the eddy field that diffuses", scale=0.3, null=0.0, typical=(0.05, 1.0))
+    kappa: Float[Array, ""] = param(0.0, "1", "share of the eddy field that diffuses", low=0.0, scale=0.3, null=0.0, typical=(0.05, 1.0))
     tau: Float[Array, ""] = param(3e-4, "s", "slowest time of diffusion", low=0.0, scale=3e-4, shape=True, typical=(2e-5, 3e-3))
 
     name = "field_diffusion"

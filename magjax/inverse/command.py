@@ -1,0 +1,62 @@
+"""What `magjax invert` does: a wanted displacement in a file to the current in a file."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import ConfigurationError, RecordingError
+from .dynamic import KNOWN_INVERSES, PlainActuator, current_for_displacement
+
+
+def invert_file(trajectory, bench, model, out) -> dict:
+    """Read time_s and displacement_m (or _um), write time_s and current_A; returns a summary."""
+    plant = PlainActuator.from_actuator(_actuator(bench, model))
+    time, wanted = _trajectory(Path(trajectory))
+    h = float(np.median(np.diff(time)))
+    current, infeasible, saturated = current_for_displacement(plant, wanted, h)
+    out = Path(out)
+    partial = out.with_name(out.name + ".part")
+    try:
+        np.savetxt(partial, np.stack([time, current], axis=1), delimiter=",", header="time_s,current_A", comments="", fmt="%.12g")
+        partial.replace(out)
+    except OSError as error:
+        raise ConfigurationError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+    left = [e for e in plant.effects if e not in KNOWN_INVERSES]
+    text = f"current {current.min():.4g} .. {current.max():.4g} A; wrote {out}"
+    if infeasible.any():
+        text += f"; {int(infeasible.sum())} samples were not feasible (0 <= u <= M_s^2) and the nearest was taken, first at t = {time[np.argmax(infeasible)]:.4g} s"
+    if saturated.any():
+        text += f"; {int(saturated.sum())} samples need a magnetization outside the fitted plane, first at t = {time[np.argmax(saturated)]:.4g} s"
+    if left:
+        text += f"; not compensated: {', '.join(left)}"
+    return {"file": str(out), "infeasible": int(infeasible.sum()), "saturated": int(saturated.sum()), "not_compensated": left, "message": text}
+
+
+def _actuator(bench, model):
+    from ..cli.runtime import prepare_jax
+
+    prepare_jax()
+    if model:
+        from ..model_file import load_model
+
+        return load_model(model)[0]
+    from ..bench import load_bench
+
+    return load_bench(bench or "aa-050h").actuator()
+
+
+def _trajectory(path):
+    from ..readers import UNITS, _parse, _read_csv
+
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file; check the name")
+    table, _ = _read_csv(path)
+    found = {}
+    for name, values in table.items():
+        quantity, unit = _parse(name)
+        if quantity in ("time", "displacement"):
+            found[quantity] = values * UNITS[quantity].get(unit, 1.0)
+    for quantity, usual in (("time", "time_s"), ("displacement", "displacement_m")):
+        if quantity not in found:
+            raise RecordingError(f"{path}: no {quantity} column among {', '.join(table)}; name it {usual}")
+    return found["time"], found["displacement"]

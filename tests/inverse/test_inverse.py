@@ -1,0 +1,93 @@
+"""Exact inversion, the implicit step and the inverse (7), against the operator and against the JAX engine."""
+
+import numpy as np
+import pytest
+
+from magjax.errors import ConfigurationError
+from magjax.inverse import PlainActuator, PlainPreisach, current_for_displacement, implicit_euler
+from magjax.preisach import Preisach
+from magjax.simulate import simulate
+from tests.test_simulate import actuator
+
+LOW, HIGH, L = -1000.0, 1000.0, 20
+
+
+def random_operator(seed, history=True):
+    rng = np.random.default_rng(seed)
+    masses = np.tril(rng.random((L, L)) * (rng.random((L, L)) > 0.5))
+    masses /= masses.sum()
+    grid = np.linspace(LOW, HIGH, L + 1)
+    past = np.where(rng.random(8) < 0.4, rng.choice(grid, 8), rng.uniform(LOW, HIGH, 8)) if history else ()
+    return PlainPreisach(masses, LOW, HIGH, 0.0, past), masses, past
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_streaming_operator_equals_the_engine(seed):
+    plain, masses, past = random_operator(seed)
+    field = np.random.default_rng(seed + 100).uniform(LOW, HIGH, 50)
+    got = np.array([plain.apply(v) for v in field])
+    expected = np.asarray(Preisach(masses, LOW, HIGH).magnetization(np.concatenate([past, field]), corners=40))[len(past) :]
+    assert np.abs(got - expected).max() < 1e-13
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_inversion_is_exact_and_within_its_iterations(seed):
+    plain, masses, _ = random_operator(seed)
+    rng = np.random.default_rng(seed)
+    check = plain.copy()
+    for _ in range(1000):
+        kind = rng.random()
+        target = plain.magnetization if kind < 0.05 else rng.uniform(-0.999, 0.999)
+        before = plain.corners
+        field = plain.solve(target)
+        assert plain.iterations <= before + L + 1
+        assert abs(plain.magnetization - target) < 1e-13
+        assert abs(check.apply(field) - target) < 1e-13
+
+
+def test_saturation_and_plateaus_are_told():
+    plain = PlainPreisach(np.eye(4) / 4, 0.0, 4.0)
+    plain.solve(2.0)
+    assert plain.saturated and plain.magnetization == pytest.approx(1.0)
+    plain.solve(-3.0)
+    assert plain.saturated and plain.corners == 0
+    with pytest.raises(ConfigurationError, match="monotone"):
+        PlainPreisach(-np.eye(3), 0, 1)
+
+
+def test_implicit_step_and_inverse_are_exact():
+    plant = PlainActuator.from_actuator(actuator(25))
+    h, n = 1e-4, 400
+    current = 0.1 + 0.6 * np.sin(2 * np.pi * np.arange(n) / 150)
+    H, M = implicit_euler(plant, current, h)
+    residual = np.diff(H + M) - h * plant.c1 * (current[1:] - (H[1:] - plant.H_bias) / plant.c0)
+    assert np.abs(residual).max() < 1e-13 * plant.M_s * 10
+    back = np.concatenate([[0.0], np.diff(H + M)]) / h / plant.c1 + (H - plant.H_bias) / plant.c0
+    again = implicit_euler(plant, back, h)[1]
+    assert np.abs(again - M).max() < 1e-12 * plant.M_s
+
+
+def test_engine_approaches_the_implicit_steps():
+    act = actuator(25)
+    plant = PlainActuator.from_actuator(act)
+    errors = []
+    for n in (400, 1600):
+        current = 0.1 + 0.6 * np.sin(2 * np.pi * np.arange(n) / n) * (1 - np.cos(2 * np.pi * np.arange(n) / n))
+        M = implicit_euler(plant, current, 0.02 / n)[1]
+        errors.append(np.abs(np.asarray(simulate(act, current, 0.02 / n).magnetization) - M).max())
+    assert errors[1] < 0.4 * errors[0] < 0.02 * plant.M_s
+
+
+def test_open_loop_tracking():
+    """The current for a wanted displacement makes the simulated actuator follow it."""
+    act = actuator(25)
+    plant = PlainActuator.from_actuator(act)
+    n, h = 2000, 5e-5
+    t = h * np.arange(n)
+    wanted = 30e-6 + 12e-6 * np.sin(2 * np.pi * 20 * t)
+    current, infeasible, saturated = current_for_displacement(plant, wanted, h)
+    assert not infeasible.any() and not saturated.any()
+    y = np.asarray(simulate(act, current, h).displacement)
+    assert np.abs(y - wanted)[n // 4 :].max() < 0.3e-6
+    far, infeasible, _ = current_for_displacement(plant, 3 * wanted, h)
+    assert infeasible.any() and np.all(np.isfinite(far))

@@ -1,0 +1,147 @@
+"""Commands as a user runs them: files, exit statuses, one-line errors with the mend, nothing half written."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fitting.demo import concealed_actuator, record
+from magjax.bench import load_bench
+from magjax.cli import COMMANDS, main
+from magjax.model_file import load_model
+from magjax.recording import load_recordings
+from magjax.simulate import simulate
+from magjax.writers import write_recording
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bench")
+    rng = np.random.default_rng(1)
+    truth = concealed_actuator(load_bench("aa-050h"))
+    for drive in ((10, 0.8, 0.1), (80, 0.5, -0.2), (250, 0.8, 0.1)):
+        write_recording(path / f"rec_{drive[0]:03d}.csv", record(truth, *drive, rng, "r"))
+    return path
+
+
+def test_fit_writes_what_the_interface_promises(folder, capsys):
+    out = folder / "result"
+    files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
+    assert main(["fit", *files, "--bench", "aa-050h", "--out", str(out), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    content = json.loads((out / "fit.json").read_text())
+    for key in ("converged", "message", "bench", "recordings", "parameters", "levels", "chi2_per_sample", "bic", "jacobians", "compile_s", "solve_s"):
+        assert key in content and key in printed
+    assert set(content["parameters"]["coil.R_eddy"]) >= {"value", "stderr", "unit", "free", "at_bound", "identified"}
+    assert content["recordings"][0]["sha256"] and content["chi2_per_sample"] < 1.25
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") >= 3 and "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")
+    assert len(page) < 1_500_000 and 'aria-label="' in page
+    # the model simulates again, bit for bit
+    actuator, bench = load_model(out)
+    again, _ = load_model(out)
+    drive = 0.1 + 0.5 * np.sin(2 * np.pi * np.arange(200) / 200)
+    a, b = (np.asarray(simulate(x, drive, 1e-4, periodic=True).reading) for x in (actuator, again))
+    assert np.array_equal(a, b) and bench.name == "aa-050h"
+    assert main(["simulate", "--model", str(out), "--frequency", "50", "--amplitude", "0.5", "--out", str(folder / "s.nc"), "--quiet"]) == 0
+    assert main(["report", str(out)]) == 0
+
+
+def test_sweep_and_convert(folder, capsys):
+    assert main(["sweep", "--frequencies", "10,100", "--amplitudes", "0.3,0.6", "--out", str(folder / "sweep.nc"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["points"] == 4
+    source = sorted(folder.glob("rec_*.csv"))[0]
+    bench = load_bench("aa-050h")
+    original = load_recordings([source], bench)[0]
+    for ending in (".nc", ".mat", ".csv"):
+        target = folder / f"copy{ending}"
+        assert main(["export", str(source), "--out", str(target), "--quiet"]) == 0
+        back = load_recordings([target], bench)[0]
+        assert back.channels["displacement"] == pytest.approx(original.channels["displacement"], rel=1e-9)
+
+
+def test_check_card(folder, capsys):
+    source = sorted(folder.glob("rec_*.csv"))[0]
+    assert main(["check", str(source)]) == 0
+    text = capsys.readouterr().out
+    assert "fit to use" in text and "10 Hz" in text and "4.000 periods" in text
+
+
+def write(path, rows, header="time_s,current_A,displacement_m"):
+    path.write_text(header + "\n" + "\n".join(",".join(f"{v:.9g}" for v in row) for row in rows) + "\n")
+    return str(path)
+
+
+def good_rows(n=400, periods=4):
+    t = np.arange(n * periods) / (50 * n)
+    current = 0.5 * np.sin(2 * np.pi * 50 * t)
+    noise = 1e-8 * np.random.default_rng(0).standard_normal(len(t))
+    return np.stack([t, current, 2e-5 + 1e-5 * current + noise], axis=1)
+
+
+def spoil(kind):
+    rows, header = good_rows(), "time_s,current_A,displacement_m"
+    if kind == "missing column":
+        return rows[:, :2], "time_s,current_A"
+    if kind == "mA for A":
+        rows[:, 1] *= 1000
+    if kind == "um for m":
+        rows[:, 2] *= 1e6
+    if kind == "NaN":
+        rows[100, 2] = np.nan
+    if kind == "gap":
+        rows[300:, 0] += 0.013
+    if kind == "clipped":
+        rows[:, 2] = np.clip(rows[:, 2], None, 2.25e-5)
+    if kind == "no samples":
+        rows = rows[:0]
+    return rows, header
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [("missing column", "displacement_m"), ("mA for A", "current_mA"), ("um for m", "displacement_um"), ("NaN", "sample 100"),
+     ("gap", "not uniform"), ("clipped", "clipped"), ("no samples", "no samples")],
+)  # fmt: skip
+def test_bad_recordings_say_the_mend_in_one_line(tmp_path, capsys, kind, words):
+    rows, header = spoil(kind)
+    path = write(tmp_path / "bad.csv", rows, header)
+    out = tmp_path / "out"
+    assert main(["fit", path, "--bench", "aa-050h", "--out", str(out), "--quiet"]) == 3
+    error = capsys.readouterr().err.strip()
+    assert words in error and "bad.csv" in error and "\n" not in error
+    assert not (out / "fit.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("[coil]\nR_edy = 3\n", "R_eddy"), ("[coil]\nR_eddy = -3\n", "negative"), ("[coil\n", "TOML"), ("[hysteresis]\nlevels = 'x'\n", "levels"), ("[fit]\nfree = ['coil.Reddy']\n", "R_eddy")],
+)
+def test_bad_bench_files_say_the_mend(tmp_path, capsys, text, words):
+    (tmp_path / "bench.toml").write_text(text)
+    path = write(tmp_path / "rec.csv", good_rows())
+    assert main(["fit", path, "--bench", str(tmp_path / "bench.toml"), "--quiet"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert words in error and "\n" not in error
+
+
+def test_wrong_use(tmp_path, capsys):
+    assert main(["ft"]) == 2 and "fit" in capsys.readouterr().err
+    assert main(["fit", str(tmp_path / "none.csv"), "--bench", "aa-050h", "--quiet"]) == 3
+    assert "no such file" in capsys.readouterr().err
+    (tmp_path / "empty.csv").write_text("")
+    assert main(["check", str(tmp_path / "empty.csv")]) == 3
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert main(["sweep", "--out", str(blocked / "x" / "y.nc"), "--quiet"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert main(["simulate", "--amplitude", "9", "--out", str(tmp_path / "s.nc"), "--quiet"]) == 2
+    assert "outside the Preisach plane" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    assert "example: magjax" in capsys.readouterr().out

@@ -1,0 +1,75 @@
+"""The diagnosis on concealed benches: silence on a null, the right name, the data's own problems."""
+
+import numpy as np
+import pytest
+
+from fitting.demo import concealed_actuator, record
+from fitting.diagnose import diagnose
+from fitting.floors import data_problem
+from fitting.setup import Choices, spectra_of
+from magjax.bench import load_bench
+from magjax.effects import SensorLag
+from magjax.recording import Recording
+
+DRIVES = ((10, 0.8, 0.1), (50, 0.5, -0.2), (120, 0.8, 0.1), (200, 0.5, -0.2), (300, 0.8, 0.1))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return load_bench("aa-050h")
+
+
+def study(bench, effect=None, seed=5):
+    rng = np.random.default_rng(seed)
+    truth = concealed_actuator(bench, effect)
+    return [record(truth, *d, rng, f"r{d[0]}") for d in DRIVES], [record(truth, 400, 0.6, 0.05, rng, "c400")]
+
+
+def test_silent_where_nothing_is_missing(bench):
+    runs, checks = study(bench)
+    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250))
+    assert found.verdict == "nothing_missing"
+    assert not found.effects and not found.groups and found.repaired is None
+    assert max(abs(c.z) for c in found.candidates) < 5.5
+    content = found.as_dict()
+    assert {"verdict", "effects", "groups", "absorbed", "unknown", "data_problem", "candidates", "floors", "where", "check",
+            "next_experiment", "message", "base", "repaired"} == set(content)  # fmt: skip
+
+
+def test_names_a_concealed_sensor_filter(bench):
+    runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
+    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250))
+    assert found.verdict == "attributed"
+    (effect,) = found.effects
+    assert effect["name"] == "sensor_lag"
+    assert effect["parameters"]["tau"]["value"] == pytest.approx(1e-4, rel=0.05)
+    row = found.check[0]
+    assert row["rms_before"] > 3 * row["noise_rms"] and row["rms_after"] < 1.4 * row["noise_rms"]
+    before, after = effect["shifts"]["mechanics.f0"]
+    assert abs(after - 405) < 0.2 * abs(before - 405)
+
+
+def test_a_transient_is_a_data_problem(bench):
+    runs, _ = study(bench)
+    run = runs[1]
+    t = run.time
+    spoiled = run.channels["displacement"] + 8e-6 * np.exp(-t / (0.2 / 50))
+    bad = Recording(t, {**run.channels, "displacement": spoiled}, {}, run.origin, "unsettled")
+    text = data_problem([bad], spectra_of([bad], bench), "displacement")
+    assert text is not None and "transient" in text
+
+
+def test_a_swapped_sign_is_a_data_problem(bench):
+    runs, _ = study(bench)
+    swapped = [Recording(r.time, {**r.channels, "displacement": 6e-5 - r.channels["displacement"]}, {}, r.origin, r.name) for r in runs]
+    found = diagnose(swapped, bench, choices=Choices(fine=250, max_jacobians=8))
+    assert found.verdict == "data_problem" and "sign" in found.message
+
+
+def test_quasistatic_loops_claim_no_rate_effect(measured):
+    from magjax.recording import load_recordings
+
+    bench = load_bench("material-loops")
+    found = diagnose(load_recordings([measured / "ferrite_mnzn" / "loops.csv"], bench), bench, choices=Choices(max_jacobians=12))
+    static = {"mean_field", "reversible_magnetization", "accommodation", "sensor_nonlinearity"}
+    assert {e["name"] for e in found.effects} | {n for g in found.groups for n in g} <= static

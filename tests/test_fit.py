@@ -1,0 +1,180 @@
+"""The joint fit on an invented bench: the noise reached, the constants within their errors, determinism, outcomes."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from fitting.demo import concealed_actuator, record
+from fitting.density import cell_basis, hat_basis
+from fitting.fit import fit
+from fitting.setup import Choices
+from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
+from fitting.spectra import estimate_noise, fit_lines, reduce_recording
+from fitting.starts import operator_rows, unfold
+from magjax.bench import load_bench
+from magjax.errors import RecordingError
+from magjax.preisach import Preisach
+from magjax.recording import Recording
+
+TRUE = {"coil.R_eddy": 62.0, "mechanics.xi": 0.81, "mechanics.f0": 405.0}
+QUICK = Choices(fine=250)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return load_bench("aa-050h")
+
+
+@pytest.fixture(scope="module")
+def recordings(bench):
+    rng = np.random.default_rng(7)
+    truth = concealed_actuator(bench)
+    return [record(truth, *drive, rng, f"r{drive[0]}") for drive in ((10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0))]
+
+
+@pytest.fixture(scope="module")
+def result(recordings, bench):
+    start = bench.actuator().replace({"coil.R_eddy": 40.0, "mechanics.xi": 0.5, "mechanics.f0": 500.0})
+    return fit(recordings, bench, actuator=start, choices=QUICK)
+
+
+def test_reaches_the_noise_and_the_constants(result):
+    assert result.converged and result.chi2_per_sample < 1.2
+    for name, true in TRUE.items():
+        estimate = result.estimate(name)
+        assert abs(estimate.value - true) < 3.5 * estimate.stderr
+        assert abs(estimate.value / true - 1) < 0.01
+    assert "noise" in result.message
+    assert "coil.R_eddy" in str(result)
+
+
+def test_is_deterministic(recordings, bench, result):
+    start = bench.actuator().replace({"coil.R_eddy": 40.0, "mechanics.xi": 0.5, "mechanics.f0": 500.0})
+    again = fit(recordings, bench, actuator=start, choices=QUICK)
+    assert np.array_equal(again.solution.z, result.solution.z)
+
+
+def test_an_unsettled_fit_says_so(recordings, bench):
+    poor = fit(recordings, bench, choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
+    assert not poor.converged
+    assert "before it settled" in poor.message
+
+
+def test_interrupt_keeps_what_was_reached(recordings, bench):
+    def stop(text, step, chi2):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    stopped = fit(recordings, bench, choices=QUICK, progress=stop, refine=False)
+    assert not stopped.converged and stopped.jacobians == 3
+    assert np.isfinite(stopped.chi2_per_sample)
+
+
+def test_one_unknown_a_cell(recordings, bench):
+    got = fit(recordings, bench, choices=dataclasses.replace(QUICK, knots=None, level=25), refine=False)
+    assert abs(got.estimate("coil.R_eddy").value / 62 - 1) < 0.05
+    assert got.actuator.hysteresis.cells == 26
+
+
+def test_aperiodic_drive_is_refused_with_the_mend(bench, recordings):
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(rng.standard_normal(2000)) * 0.01
+    recording = Recording(np.arange(2000) * 1e-4, {"current": walk, "displacement": 1e-6 * walk**2}, name="walk")
+    with pytest.raises(RecordingError, match="does not repeat"):
+        fit([*recordings, recording], bench)
+
+
+@pytest.mark.parametrize("make", [lambda: hat_basis(-100.0, 900.0, 1.0, 20, 7, 6), lambda: cell_basis(-100.0, 900.0, 1.0, 12)])
+def test_linear_rows_are_the_operator(make):
+    """What the start solves for is what the simulator computes."""
+    basis = make()
+    rng = np.random.default_rng(2)
+    x = rng.random(basis.unknowns)
+    field = rng.uniform(-100, 900, 40)
+    operator = Preisach(basis.masses(x), basis.low, basis.high, float(basis.masses(x).sum()))
+    assert operator_rows(basis, field) @ x == pytest.approx(np.asarray(operator.magnetization(field, corners=30)), abs=1e-12)
+
+
+def test_bounded_step_meets_the_optimality_conditions():
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        A = rng.standard_normal((30, 30))
+        A, g, y = A @ A.T + 0.1 * np.eye(30), rng.standard_normal(30), np.maximum(rng.standard_normal(30), 0)
+        bounded = np.arange(30) < 24
+        d = np.asarray(bounded_step(jnp.asarray(A), jnp.asarray(g), jnp.asarray(y), jnp.asarray(bounded)))
+        slope = A @ d + g
+        at = bounded & (y + d < 1e-9)
+        assert (y + d)[bounded].min() > -1e-10
+        assert np.abs(slope[~at]).max() < 1e-7 and slope[at].min(initial=0) > -1e-7
+
+
+def test_solver_runs_behind_optimistix():
+    target = jnp.asarray([1.0, -2.0, 3.0])
+
+    def residual(y, args):
+        return jnp.concatenate([jnp.exp(0.3 * y) - jnp.exp(0.3 * target), 0.01 * y])
+
+    nonnegative = jnp.asarray([True, True, False])
+    solution = optx.least_squares(residual, ProjectedLevenbergMarquardt(nonnegative, atol=1e-9), jnp.ones(3), max_steps=50)
+    assert float(solution.value[1]) == 0.0
+    assert float(solution.value[0]) == pytest.approx(1.0, abs=0.01)
+    assert float(solution.value[2]) == pytest.approx(3.0, abs=0.01)
+
+
+def test_lines_need_no_whole_periods():
+    f, dt, n = 7.3, 1e-3, 1234
+    t = dt * np.arange(n)
+    signal = 0.5 + 2 * np.cos(2 * np.pi * f * t - 0.4) + 0.3 * np.sin(6 * np.pi * f * t)
+    lines, rest = fit_lines(signal, f * t, 6)
+    assert lines[0].real == pytest.approx(0.5) and lines[1] == pytest.approx(np.exp(-0.4j)) and abs(lines[3]) == pytest.approx(0.15)
+    assert np.abs(rest).max() < 1e-10
+
+
+def test_noise_is_found_between_the_harmonics():
+    rng = np.random.default_rng(4)
+    spectra = []
+    for f in (10, 40):
+        n = 4000
+        t = np.arange(n) / (1000 * f)
+        drive = np.sin(2 * np.pi * f * t)
+        y = 1e-5 * drive**3 + 30e-9 * rng.standard_normal(n)
+        spectra.append(reduce_recording(Recording(t, {"current": drive, "displacement": y}, name=str(f)), "current", "displacement"))
+    assert estimate_noise(spectra).rms == pytest.approx(30e-9, rel=0.05)
+
+
+def test_unfold_finds_the_sign_of_M():
+    drive = np.cos(2 * np.pi * np.arange(200) / 200)
+    M = drive - 0.3
+    # the one sample beside the crossing may fall on either side
+    assert unfold(np.abs(M), drive) == pytest.approx(M, abs=0.035)
+    assert unfold(np.abs(drive + 3), drive) == pytest.approx(drive + 3)
+
+
+def test_rod_in_a_coil(measured):
+    """Measured: the eddy term from 10 and 50 Hz predicts 20 Hz nearly to its noise."""
+    from fitting.check import check_errors
+    from magjax.recording import load_recordings
+
+    bench = load_bench("rod-eddy")
+    folder = measured / "rod_eddy"
+    runs = load_recordings([folder / "captures_f010.csv", folder / "captures_f050.csv"], bench)
+    got = fit(runs, bench, refine=False)
+    k = got.estimate("coil.k_eddy")
+    assert 0.03 < k.value < 0.08 and k.stderr < 0.01
+    row = check_errors(got.actuator, got.actuator, load_recordings([folder / "captures_f020.csv"], bench), bench)[0]
+    assert row["rms_after"] < 1.7 * row["noise_rms"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(40))
+def test_constants_within_their_errors_at_forty_seeds(bench, seed):
+    rng = np.random.default_rng(seed)
+    truth = concealed_actuator(bench)
+    drives = ((10, 0.8, 0.1), (20, 0.5, -0.2), (50, 0.8, 0.1), (100, 0.5, -0.2), (150, 0.8, 0.1), (200, 0.5, -0.2), (300, 0.8, 0.1))
+    got = fit([record(truth, *d, rng, str(d[0])) for d in drives], bench)
+    assert all(abs(got.estimate(n).value - v) < 4 * got.estimate(n).stderr for n, v in TRUE.items())
+    jax.clear_caches()
