@@ -122,7 +122,10 @@ def _read_mat(path):
 
 
 def _read_log(path):
-    from .acquire.log import read_log
+    try:
+        from .acquire.log import read_log
+    except ImportError:
+        raise RecordingError(f"{path}: raw acquisition logs need magjax.acquire, which this installation lacks; export the log to .nc first") from None
 
     time, channels, header, _ = read_log(path)
     return {"time_s": time, **channels}, dict(header)

@@ -73,6 +73,49 @@ class Recording:
         f = self.frequency()
         return 0.0 if f is None else len(self.time) * self.dt * f
 
+    @property
+    def n_samples(self) -> int:
+        """Samples a channel."""
+        return len(self.time)
+
+    @property
+    def duration(self) -> float:
+        """s, the step after the last sample included."""
+        return self.n_samples * self.dt
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether the drive repeats."""
+        return self.frequency() is not None
+
+    def period_samples(self) -> float | None:
+        """Samples a period, not rounded; None where aperiodic."""
+        f = self.frequency()
+        return None if f is None else 1.0 / (f * self.dt)
+
+    def repeats(self, channel: str) -> np.ndarray:
+        """Whole periods of a channel at common phases, SI, (periods, samples a period); (0, 0) where aperiodic.
+
+        Cubic splines where the period does not divide the sampling.
+        """
+        values, per = np.asarray(self.channels[channel], float), self.period_samples()
+        if per is None:
+            return np.zeros((0, 0))
+        count, width = int(np.floor(len(values) / per + 1e-6)), int(round(per))
+        if abs(per - width) * count < 1e-3:
+            return values[: count * width].reshape(count, width)
+        from scipy.interpolate import CubicSpline
+
+        at = per * (np.arange(count)[:, None] + np.arange(width) / width)
+        return CubicSpline(np.arange(len(values)), values)(np.minimum(at, len(values) - 1))
+
+    def repeat_noise(self, channel: str) -> float | None:
+        """Noise rms of a channel by what its periods differ, SI; None with less than two periods. Drift counts as noise."""
+        blocks = self.repeats(channel)
+        if len(blocks) < 2:
+            return None
+        return float(np.sqrt(np.mean(np.var(blocks, axis=0, ddof=1))))
+
 
 def _check_clipping(name, channel, values):
     span = np.ptp(values)
@@ -90,7 +133,11 @@ def _check_clipping(name, channel, values):
         # a crest sampled with little noise is round: the samples beside a clipped plateau arrive with a slope
         first = starts[np.argmax(ends - starts)]
         before = abs(values[max(first - 1, 0)] - values[max(first - 3, 0)])
-        if before > 1.5e-3 * span and first > 3:
+        # a round crest widens with the root of the depth below it, a plateau hardly at all
+        near = np.flatnonzero(np.abs(values - extreme) > 0.01 * span)
+        below, above = near[near < first], near[near > first]
+        wide = (above[0] if len(above) else len(values)) - (below[-1] + 1 if len(below) else 0)
+        if (before > 1.5e-3 * span or longest > 0.75 * wide) and first > 3:
             raise RecordingError(
                 f"{name}: {channel} is clipped at its {word} value {extreme:.6g} for {longest} samples from sample {first}; "
                 "lower the gain or the drive and record again"
@@ -100,8 +147,8 @@ def _check_clipping(name, channel, values):
 def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
     """The repetition frequency of a signal to sub-sample precision, Hz.
 
-    From the hint or the autocorrelation, then refined by maximising the power in the first harmonics of a least-squares
-    fit over the whole record (periods need not divide the record).
+    From the hint or the autocorrelation, then refined by least squares of the strongest harmonics over the whole record
+    (periods need not divide the record).
     """
     n = len(x)
     x = x - x.mean()
@@ -111,7 +158,7 @@ def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
         f = float(hint)
         if n * dt * f < 0.9:
             return None
-        return _refine(x, dt, f) if n * dt * f > 1.2 else f
+        return _refine(x, dt, f, 0.25 / (n * dt)) if n * dt * f > 1.2 else f
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.abs(np.fft.rfft(x, size)) ** 2
     raw = np.fft.irfft(spectrum, size)[:n]
@@ -126,29 +173,44 @@ def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
         tail = usable[below[0] :]
         best = tail.max() if len(tail) else 0.0
         if best > 0.9:
-            peaks = np.flatnonzero((tail[1:-1] >= tail[:-2]) & (tail[1:-1] >= tail[2:]) & (tail[1:-1] > best - 0.02)) + 1
+            # the first peak as high as the highest, but for noise and for half a sample's shift
+            slack = min(0.02, 1e-3 + 0.3 * (1 - float(correlation[1])) + 2 * (1 - min(float(best), 1.0)))
+            peaks = np.flatnonzero((tail[1:-1] >= tail[:-2]) & (tail[1:-1] >= tail[2:]) & (tail[1:-1] > best - slack)) + 1
             if len(peaks):
-                return _refine(x, dt, 1.0 / ((below[0] + peaks[0]) * dt))
+                lag = below[0] + peaks[0]
+                return _refine(x, dt, 1.0 / (lag * dt), 1.0 / (lag**2 * dt))
     # one period alone: it closes on itself
     if abs(x[0] - x[-1]) < 4 * np.abs(np.diff(x)).max():
         return 1.0 / (n * dt)
     return None
 
 
-def _refine(x, dt, f):
+def _refine(x, dt, f, reach):
+    """The f within `reach` (Hz) whose strongest harmonics leave least of x: a scan, then parabolas.
+
+    The strongest lines are used, not the first ones: a modulated sine has its power far above its fundamental.
+    """
     n = len(x)
     t = dt * np.arange(n)
+    per = 1 / (f * dt)
+    orders = np.arange(1, max(2, int(min(60, 0.4 * per)) + 1))
+    strength = np.array([abs(np.dot(x, np.exp(-2j * np.pi * h * f * t))) for h in orders])
+    orders = orders[np.argsort(-strength, kind="stable")[:5]]
+    orders = orders[strength[orders - 1] > 0.02 * strength.max()]
 
     def leftover(freq):
         angle = 2 * np.pi * freq * t
-        design = np.stack([np.ones(n)] + [g(h * angle) for h in (1, 2, 3) for g in (np.cos, np.sin)])
-        coefficients = np.linalg.solve(design @ design.T + 1e-12 * n * np.eye(7), design @ x)
+        design = np.stack([np.ones(n)] + [g(h * angle) for h in orders for g in (np.cos, np.sin)])
+        coefficients = np.linalg.solve(design @ design.T + 1e-12 * n * np.eye(len(design)), design @ x)
         return np.sum((x - coefficients @ design) ** 2)
 
-    width = 0.25 / (n * dt)
-    for _ in range(12):
-        trial = np.array([f - width, f, f + width])
-        cost = np.array([leftover(v) for v in trial])
+    step = 0.15 / (n * dt * orders.max())
+    around = f + step * np.arange(-int(np.ceil(reach / step)), int(np.ceil(reach / step)) + 1)
+    around = around[around > 0.5 * f]
+    f = float(around[np.argmin([leftover(v) for v in around])])
+    width = step
+    for _ in range(10):
+        cost = np.array([leftover(v) for v in (f - width, f, f + width)])
         bend = cost[0] - 2 * cost[1] + cost[2]
         shift = 0.5 * (cost[0] - cost[2]) / bend * width if bend > 0 else width * np.sign(cost[0] - cost[2])
         f += float(np.clip(shift, -width, width))
