@@ -21,13 +21,20 @@ NOISE = 40e-9  # m rms
 SAMPLES, PERIODS = 1000, 4
 
 
-def concealed_actuator(bench, effect=None):
-    """The bench's actuator with other constants, a density of another form on a finer plane, and a hidden effect."""
+def concealed_actuator(bench, effect=None, rough: bool = False):
+    """The bench's actuator with other constants, a density of another form on a finer plane, and a hidden effect.
+
+    `rough`: a density with a 40 % ripple and a second lobe, which does not factorise.
+    """
     actuator = bench.actuator().replace(TRUTH)
 
     def density(s, r):
         lognormal = np.exp(-0.5 * (np.log(np.maximum(r, 1e-9) / 1500) / 0.6) ** 2) / np.maximum(r, 1.0)
-        return lognormal * (1 + (s / 9000) ** 2) ** -2 + 1e-7 * np.exp(-((s / 9000) ** 2))
+        value = lognormal * (1 + (s / 9000) ** 2) ** -2 + 1e-7 * np.exp(-((s / 9000) ** 2))
+        if not rough:
+            return value
+        ripple = 1 + 0.4 * np.sin(s / 900 + r / 400) * np.cos(r / 300 - s / 2100)
+        return value * ripple + 3e-5 * np.exp(-(((s - 6000) / 2500) ** 2) - ((r - 2500) / 700) ** 2)
 
     low, high = -2.0e3, 2.75e4
     masses = density_masses(density, 160, low, high, 0.33 * float(actuator.magnetostriction.M_s), refine=4)

@@ -84,6 +84,7 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
     problem = data_problem(recordings, base.spectra, bench.output) or wrong_bench(base)
     if problem:
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
+    base, zero = _sensor_zero(recordings, bench, base, actuator, held, choices, progress)
     say("between the harmonics", 0, base.chi2_per_sample)
     adopted, recordings, base_now = _record_level(recordings, bench, base, choices, progress)
     candidates = screen(base_now.problem, base_now.refined)
@@ -97,14 +98,28 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
     absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY)
     state = _search(recordings, bench, base_now, candidates, choices, progress)
     common = {"floors": floors, "where": place, "absorbed": absorbed, "base": base}
-    return _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common)
+    found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common)
+    if zero is None:
+        return found
+    note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
+    return dataclasses.replace(found, message=found.message + note)
+
+
+def _sensor_zero(recordings, bench, base, actuator, held, choices, progress):
+    """A sensor whose zero is not the rod's rest: adopted as part of the base only if that alone meets the noise."""
+    if bench.output != "displacement" or base.chi2_per_sample < 3 or "sensor.offset" in bench.free:
+        return base, None
+    freed = fit(recordings, bench, actuator=actuator, extra=(*held, "sensor.offset"), choices=choices, progress=progress)
+    if freed.chi2_per_sample > SILENT_CHI2:
+        return base, None
+    return freed, freed.estimate("sensor.offset").value
 
 
 def _record_level(recordings, bench, base, choices, progress):
     """Drift, heat and hum: adopted one by one, taken out of the readings, the base fitted again."""
     adopted, current = [], base
     for _ in range(0 if base.problem.quasistatic or bench.output != "displacement" else 2):
-        found = record_effects(recordings, current.spectra)
+        found = [e for e in record_effects(recordings, current.spectra) if e.name not in {a.name for a, _ in adopted}]
         best = found[0]
         if abs(best.z) < RECORD_Z:
             break
@@ -185,9 +200,10 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     excess = state.current.chi2_per_sample
     effects, groups = [], []
     for effect, rivals in adopted:
-        effects.append(_record_row(effect))
         if rivals:
             groups.append([effect.name, *[r.name for r in rivals]])
+        else:
+            effects.append(_record_row(effect))
     last_rivals = []
     for best, rivals, good, previous in state.steps:
         if len(rivals) > 1:

@@ -106,7 +106,10 @@ def remove_record_effect(recordings, effect, output):
         if len(column) < len(signal):
             signal[len(column) :] = signal[len(column) - 1]
         channels = {**recording.channels, output: recording.channels[output] - signal}
-        cleaned.append(Recording(recording.time, channels, recording.noise, recording.origin, recording.name))
+        origin = recording.origin
+        if effect.name == "mains_hum":
+            origin = {**origin, "hum": (effect.shapes["f"], effect.amplitude)}
+        cleaned.append(Recording(recording.time, channels, recording.noise, origin, recording.name))
     return cleaned
 
 

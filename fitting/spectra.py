@@ -37,6 +37,7 @@ class Spectrum:
     drive_noise: float
     given_noise: float | None = None
     noise: object = None
+    hum: tuple[float, float] | None = None  # frequency, Hz, and amplitude of a hum taken out where it can be told
 
     @property
     def noise_rms(self) -> float:
@@ -99,7 +100,7 @@ def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMON
         keep &= np.abs(order - np.round(order)) > 0.3
     return Spectrum(
         recording.name, frequency, periods, samples, dt, drive_lines, lines, f[keep], spectrum[keep], residue,
-        float(np.ptp(y)), drive_noise, (recording.noise or {}).get(output),
+        float(np.ptp(y)), drive_noise, (recording.noise or {}).get(output), hum=recording.origin.get("hum"),
     )  # fmt: skip
 
 
@@ -183,4 +184,9 @@ def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
     lowest = spectrum.frequency / max(spectrum.periods, 1)
     f = np.maximum(np.arange(count) * spectrum.frequency, lowest)
     variance = noise.density(f) / spectrum.samples
+    if spectrum.hum is not None:
+        # lines on the hum carry it with an unknown phase, lines beside it what its removal left: they count for less
+        away = np.abs(np.arange(count) * spectrum.frequency - spectrum.hum[0])
+        left = np.where(away < 0.6 * lowest, 1.0, 0.25 * np.minimum(1.0, lowest / (np.pi * np.maximum(away, lowest))))
+        variance = variance + (left * spectrum.hum[1]) ** 2 / 4
     return np.sqrt(np.where(np.arange(count) == 0, variance, 0.5 * variance))
