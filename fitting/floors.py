@@ -117,9 +117,10 @@ def data_problem(recordings, spectra, output) -> str | None:
     """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
     for recording, s in zip(recordings, spectra, strict=True):
         y = np.asarray(recording.channels[output])[: s.samples]
-        step = int(round(s.samples / s.periods))
         if s.periods >= 2:
-            blocks = y[: step * s.periods].reshape(s.periods, step)
+            step = int(s.samples / s.periods)
+            cycles = np.arange(s.samples) * s.dt * s.frequency  # periods need not divide the sampling
+            blocks = np.stack([np.interp(k + np.arange(step) / step, cycles, y) for k in range(s.periods)])
             first = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))
             later = float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if s.periods > 2 else 0.0
             floor = np.sqrt(2 * s.noise.white)

@@ -59,6 +59,16 @@ def test_a_transient_is_a_data_problem(bench):
     assert text is not None and "transient" in text
 
 
+def test_periods_that_do_not_divide_are_no_data_problem():
+    bench = load_bench("aa-050h")
+    rng = np.random.default_rng(2)
+    t = np.arange(900) / 20000.0
+    current = 0.5 * np.sin(2 * np.pi * 101.3 * t)
+    y = 3e-5 + 1e-5 * current + 3e-6 * current**3 + 4e-8 * rng.standard_normal(len(t))
+    run = Recording(t, {"current": current, "displacement": y}, name="free-running clock")
+    assert data_problem([run], spectra_of([run], bench), "displacement") is None
+
+
 def test_a_swapped_sign_is_a_data_problem(bench):
     runs, _ = study(bench)
     swapped = [Recording(r.time, {**r.channels, "displacement": 6e-5 - r.channels["displacement"]}, {}, r.origin, r.name) for r in runs]
