@@ -155,7 +155,7 @@ def test_unfold_finds_the_sign_of_M():
 
 
 def test_rod_in_a_coil(measured):
-    """Measured: the eddy term from 10 and 50 Hz predicts 20 Hz nearly to its noise."""
+    """Measured: the main job runs on real captures. The value of k is not established (see the README's limits)."""
     from fitting.check import check_errors
     from magjax.recording import load_recordings
 
