@@ -11,7 +11,7 @@ from ..errors import ConfigurationError
 from .operator import PlainPreisach
 
 MU0 = 4e-7 * np.pi
-KNOWN_INVERSES = ("amplifier_lag", "transport_delay", "sensor_lag")
+KNOWN_INVERSES = ("amplifier_lag",)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,8 +80,7 @@ def feasible_magnetization(plant: PlainActuator, displacement, h: float):
 def current_for_displacement(plant: PlainActuator, displacement, h: float):
     """The current to apply, A, by the inverse (7), with the secant of M: exact for the implicit Euler model.
 
-    Returns (current, infeasible samples, saturated samples). Effects with a known inverse (amplifier lag, delays of
-    the sensor) are compensated; the others are not.
+    Returns (current, infeasible samples, saturated samples). Of the effects, those in `KNOWN_INVERSES` are compensated.
     """
     wanted, infeasible = feasible_magnetization(plant, displacement, h)
     operator = plant.operator.copy()

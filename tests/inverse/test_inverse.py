@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from magjax.effects import AmplifierLag
 from magjax.errors import ConfigurationError
 from magjax.inverse import PlainActuator, PlainPreisach, current_for_displacement, implicit_euler
 from magjax.preisach import Preisach
@@ -89,5 +90,12 @@ def test_open_loop_tracking():
     assert not infeasible.any() and not saturated.any()
     y = np.asarray(simulate(act, current, h).displacement)
     assert np.abs(y - wanted)[n // 4 :].max() < 0.3e-6
+    import dataclasses
+
+    late = dataclasses.replace(plant, effects={"amplifier_lag": {"tau": 2e-4}})
+    behind = act.with_effect(AmplifierLag(tau=2e-4))
+    for model, better in ((plant, False), (late, True)):
+        error = np.asarray(simulate(behind, current_for_displacement(model, wanted, h)[0], h).displacement) - wanted
+        assert (np.abs(error[n // 4 : -20]).max() < 0.3e-6) == better
     far, infeasible, _ = current_for_displacement(plant, 3 * wanted, h)
     assert infeasible.any() and np.all(np.isfinite(far))
