@@ -43,14 +43,19 @@ def chi2_of(result) -> float:
     return result.chi2_per_sample * result.data_count
 
 
+STRUCTURES = ("eddy_currents",)  # their column at null says little: at their real size they change which relays switch
+
+
 def leaders(candidates, count: int = LEADERS):
-    """The candidates worth a fit: the highest scores, and those of other blocks that come near the first."""
+    """The candidates worth a fit: the highest scores, those of other blocks that come near the first, and structures."""
     visible = [c for c in candidates if abs(c.z) > 3 and c.visibility > 1e-3]
     chosen = visible[:count]
     best = abs(visible[0].z) if visible else 0.0
     for c in visible[count:]:
         if c.block not in {x.block for x in chosen} and abs(c.z) > 0.7 * best:
             chosen.append(c)
+    if chosen:
+        chosen += [c for c in candidates if c.name in STRUCTURES and c not in chosen]
     return chosen
 
 

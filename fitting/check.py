@@ -15,7 +15,7 @@ def prediction(actuator, recording, bench):
     if recording.frequency() is None:
         signals = simulate(actuator, recording.channels[bench.drive], recording.dt)
         return np.asarray(signals.reading), measured, None
-    s = reduce_recording(recording, bench.drive, bench.output)
+    s = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
     corners = int(4 * np.ceil(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) / 4))
     lines = np.asarray(Predictor.build([s], 500, 40, 4, corners)(actuator))[0]
     phases = np.arange(s.samples) * s.dt * s.frequency

@@ -41,10 +41,11 @@ class DensityBasis:
         return (self.total * (self.cells @ np.asarray(x))).reshape(self.size, self.size)
 
 
-def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: int = 18, knots_r: int = 13, crowd: float = 1.0) -> DensityBasis:
+def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: int = 18, knots_r: int = 13, crowd: float = 1.0, reversible: bool = False) -> DensityBasis:
     """Bilinear hats for fields between `low` and `high` (A/m) at level `level`, and the once-switching column.
 
-    `crowd` > 1 gathers the knots in the middle of the plane, where soft materials switch.
+    `crowd` > 1 gathers the knots in the middle of the plane, where soft materials switch; `reversible` adds hats on the
+    diagonal alone: a part without hysteresis, which hats in r can only make as a spike that their penalty resists.
     """
     step = (high - low) / level
     size, refine = level + 1, 4
@@ -76,12 +77,18 @@ def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: i
         mass = np.zeros((size, size))
         mass[1:, 0] = once[:, k] / level
         columns.append(mass.ravel())
+    once_end = len(columns)
+    for k in range(knots_s if reversible else 0):
+        on_diagonal = np.diag(_hats(low + step * (np.arange(level) + 0.5), s_knots)[:, k] / level)
+        columns.append(np.pad(on_diagonal, ((1, 0), (1, 0))).ravel())
     cells = np.stack(columns, axis=1)
     penalties = [
         _differences([[number.get((a + d, b)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
         _differences([[number.get((a, b + d)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
-        _differences([[main + k - 1, main + k, main + k + 1] for k in range(1, once.shape[1] - 1)], cells.shape[1], ridge=range(main, cells.shape[1])),
+        _differences([[main + k - 1, main + k, main + k + 1] for k in range(1, once.shape[1] - 1)], cells.shape[1], ridge=range(main, once_end)),
     ]
+    if reversible:
+        penalties.append(_differences([[once_end + k - 1, once_end + k, once_end + k + 1] for k in range(1, knots_s - 1)], cells.shape[1]))
     flat = np.ones(cells.shape[1])
     flat[main:] = 0.05
     return DensityBasis(low - step, high, size, cells, tuple(penalties), total, flat, knots_s, knots_r)

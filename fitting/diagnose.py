@@ -11,7 +11,7 @@ import numpy as np
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 
-from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, TIE, chi2_of, confidence, leaders, rivals_of, try_effect
+from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, STRUCTURES, TIE, chi2_of, confidence, leaders, rivals_of, try_effect
 from .check import check_errors
 from .experiments import next_experiment
 from .fit import REFINE_BETWEEN, fit
@@ -157,7 +157,7 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
         trials = []
         for c in top:
             settled = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
-            if settled and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
+            if settled and c.name not in STRUCTURES and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
                 continue
             say(f"trying {c.name}", 0, state.current.chi2_per_sample)
             trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress)

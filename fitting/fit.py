@@ -36,7 +36,7 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     problem, z = build_problem(spectra, actuator, bench, names, choices, start)
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
-    solution = solve(problem, z, START_WEIGHTS, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
+    solution = solve(problem, z, START_WEIGHTS[: len(problem.layout.penalties)], max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
     if refine and choices.knots is not None:
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report)
     return finish(problem, solution, choices, bench, recordings, warm)

@@ -138,7 +138,7 @@ class Predictor(eqx.Module):
         """Complex Fourier coefficients 0..harmonics of the reading, (recordings, harmonics + 1)."""
 
         def one(drive, dt):
-            signals = run_chain(actuator, drive, dt, self.periods, self.corners, "trapezoid")
+            signals = run_chain(actuator, drive, dt, self.periods, self.corners)
             return jnp.fft.rfft(signals.reading)[: self.harmonics + 1] / drive.shape[0]
 
         parts = [jax.vmap(one)(drive, dt) for drive, dt in zip(self.drives, self.steps, strict=True)]
@@ -153,11 +153,15 @@ class Target(eqx.Module):
     weights: jax.Array  # one per penalty family
     priors: jax.Array  # 1 / standard deviation in optimiser units per coordinate, 0 where free
     bottom_prior: jax.Array
+    gain_rows: jax.Array  # (recordings, harmonics + 1) complex, unit direction of each whitened reading
+    gain_shares: jax.Array  # (recordings, recordings), what uncertain scales take off the misfits along them
 
 
 def whitened(lines, target: Target):
-    """Real residual vector of complex lines: (model - measured) / deviation, mean lines real."""
+    """Real residual vector of complex lines: (model - measured) / deviation, mean lines real, uncertain scales taken off."""
     misfit = (lines - target.lines) / target.deviations
+    along = jnp.sum((jnp.conj(target.gain_rows) * misfit).real, axis=1)
+    misfit = misfit - (target.gain_shares @ along)[:, None] * target.gain_rows
     return jnp.concatenate([misfit.real.ravel(), misfit[:, 1:].imag.ravel()])
 
 

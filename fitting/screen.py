@@ -98,7 +98,7 @@ def _steady_state(predictor, actuator):
     def one(drive, dt):
         from magjax.simulate import run_chain
 
-        s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners, "trapezoid")
+        s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners)
         return s.field, s.magnetization
 
     return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
@@ -155,7 +155,7 @@ def _march_columns(predictor, actuator, effects, directions):
             table = changed.hysteresis.table()
             memory = changed.hysteresis.memory(table, predictor.corners)
             whole_drive = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (applied, current)]
-            H, M, v, res, over = magnetize(changed, *whole_drive, dt, memory)
+            H, M, v, res, over = magnetize(changed, *whole_drive, dt, memory, changed.coil.scheme)
             H, M, v, res = (x[-count - 1 : -1] for x in (H, M, v, res))
             s = finish_chain(changed, line, drive, current, H, M, v, res, over)
             return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / count

@@ -14,11 +14,12 @@ from .density import cell_basis, hat_basis
 from .joint import Problem
 from .model import Layout, Predictor, Target, make_start_actuator
 from .solver import bounded_step
-from .spectra import HARMONICS, line_deviations, reduce_recording, with_noise
+from .spectra import HARMONICS, gain_rows, line_deviations, reduce_recording, with_noise
 from .starts import equation_error_start, scan_loss
 
-START_WEIGHTS = (1e2, 1e2, 1e2)
+START_WEIGHTS = (1e2, 1e2, 1e2, 1e2)  # one a family of penalties; the last where there is a reversible part
 PLANE_MARGIN = 0.01
+EDDY_EFFECT = "effects.eddy_currents.k"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +46,7 @@ def spectra_of(recordings, bench, harmonics: int = HARMONICS):
                 f"{recording.name}: the {recording.drive} does not repeat; a fit needs periodic drives (one whole period at least), "
                 "give this recording with --check instead"
             )
-        spectra.append(reduce_recording(recording, bench.drive, bench.output, harmonics))
+        spectra.append(reduce_recording(recording, bench.drive, bench.output, harmonics, bench.columns))
     return with_noise(spectra)
 
 
@@ -81,16 +82,17 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     else:
         crowd = 1.7 if bench.drive == "field" else 1.0
         level = 2 * choices.level if bench.drive == "field" else choices.level
-        basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd)
+        basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive == "field")
     harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
     deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
-    if "coil.k_eddy" in names:  # field-driven benches differ by decades: find the scale first
-        full = [line_deviations(s, s.noise) for s in spectra]
+    full = [line_deviations(s, s.noise) for s in spectra]
+    starter = actuator  # its coil holds all of the eddy loss, for the equation error
+    for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" else ():
+        # field-driven benches differ by decades: find the scale first
         found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
-        actuator = actuator.replace({"coil.k_eddy": found})
+        actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})
     if start is None:
-        full = [line_deviations(s, s.noise) for s in spectra]
-        x, bottom, _ = equation_error_start(basis, spectra, full, actuator, jax.jit(bounded_step))
+        x, bottom, _ = equation_error_start(basis, spectra, full, starter, jax.jit(bounded_step))
         start = np.append(x, bottom)
     known = actuator.parameters()
     values = [float(known[n][0]) for n in names]
@@ -100,13 +102,20 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     layout = Layout.build(basis, names, values, scales, log)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners = int(4 * np.ceil(corners / 4))
-    predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in (choices.coarse, choices.fine))
+    # a narrow loop under a strong field turns within a few samples
+    finer = 2 if bench.drive == "field" else 1
+    grids = (finer * choices.coarse, finer * choices.fine)
+    predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in grids)
     lines = np.stack([s.reading[: harmonics + 1] for s in spectra])
     deviations = np.stack(deviations)
     if actuator.output == "flux_density":  # an integrated emf has no mean
         deviations[:, 0] = np.inf
     priors = np.asarray([_prior(bench, *row) for row in zip(names, values, log, infos, strict=True)])
-    target = Target(jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS), jnp.asarray(priors), jnp.asarray(1e-3))
+    rows, shares = gain_rows(spectra, deviations)
+    target = Target(
+        jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS[: len(basis.penalties)]), jnp.asarray(priors), jnp.asarray(1e-3),
+        jnp.asarray(rows), jnp.asarray(shares),
+    )  # fmt: skip
     problem = Problem(layout, make_start_actuator(actuator, basis), predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names))])
 

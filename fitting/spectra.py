@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 HARMONICS = 40
+LOW_ORDERS = 10  # of a converter's integral nonlinearity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Spectrum:
     drive_noise: float
     given_noise: float | None = None
     noise: object = None
+    systematic: np.ndarray | None = None  # what the converters leave in each reading line, deviation of its parts
+    gain_accuracy: float = 0.0  # the reading's scale in this recording, relative standard deviation
     hum: tuple[float, float] | None = None  # frequency, Hz, and amplitude of a hum taken out where it can be told
 
     @property
@@ -77,8 +80,9 @@ def fit_lines(signal: np.ndarray, phases: np.ndarray, count: int):
     return lines, signal - evaluate_lines(lines, phases)
 
 
-def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMONICS) -> Spectrum:
-    """The `Spectrum` of a periodic recording: `drive` and `output` name its channels."""
+def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMONICS, columns=None) -> Spectrum:
+    """The `Spectrum` of a periodic recording: `drive` and `output` name its channels; `columns`: the bench's."""
+    columns = columns or {}
     dt, frequency = float(recording.dt), float(recording.frequency())
     x, y = (np.asarray(recording.channels[c], float) for c in (drive, output))
     per_period = 1.0 / (frequency * dt)
@@ -91,7 +95,8 @@ def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMON
     count = min(harmonics, int(per_period / 2) - 1)
     lines, residue = fit_lines(y, phases, count)
     drive_lines, drive_residue = fit_lines(x, phases, int(min(4 * harmonics, per_period / 2 - 1)))
-    drive_lines, drive_noise = significant_lines(drive_lines, drive_residue, periods)
+    drive_step = quantum(np.ptp(x), columns.get(drive, {}))
+    drive_lines, drive_noise = significant_lines(drive_lines, drive_residue, periods, drive_step)
     spectrum = np.abs(np.fft.rfft(residue)) ** 2 / samples
     f = np.fft.rfftfreq(samples, dt)
     order = f * (1 / frequency)
@@ -100,20 +105,48 @@ def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMON
         keep &= np.abs(order - np.round(order)) > 0.3
     return Spectrum(
         recording.name, frequency, periods, samples, dt, drive_lines, lines, f[keep], spectrum[keep], residue,
-        float(np.ptp(y)), drive_noise, (recording.noise or {}).get(output), hum=recording.origin.get("hum"),
+        float(np.ptp(y)), drive_noise, (recording.noise or {}).get(output),
+        systematic=systematic_deviations(lines, drive_lines, frequency, drive_step, columns.get(output, {}), float(np.ptp(y))),
+        gain_accuracy=float(columns.get(output, {}).get("gain_accuracy", 0.0)), hum=recording.origin.get("hum"),
     )  # fmt: skip
 
 
-def significant_lines(lines: np.ndarray, residue: np.ndarray, periods: int):
+def quantum(peak_to_peak: float, column) -> float:
+    """Rms of a converter's rounding, unit of the channel: (peak to peak / 2^bits) / sqrt(12), 0 where no bits are stated."""
+    return float(peak_to_peak) / 2 ** column["bits"] / np.sqrt(12) if "bits" in column else 0.0
+
+
+def systematic_deviations(lines, drive_lines, frequency, drive_step, column, peak_to_peak):
+    """What rounding and its nonlinearity leave in each reading line whatever the averaging, or None.
+
+    A converter's error repeats with the signal, so repeats do not show it: its rms is shared by the first ten orders and
+    fades above, as integral nonlinearity does. An error of the drive passes on by the slope of the loop; that of an emf
+    by the integral.
+    """
+    order = np.arange(len(lines))
+    if "emf_turns" in column:
+        pace = 2 * np.pi * frequency * np.maximum(order, 1)
+        rate = evaluate_lines(lines * pace * np.where(order > 0, 1j, 0), np.arange(512) / 512)
+        step = quantum(np.ptp(rate), column) / pace
+    else:
+        step = np.full(len(lines), quantum(peak_to_peak, column))
+    slope = abs(lines[1]) / max(abs(drive_lines[1]), 1e-300)
+    share = np.sqrt(2 / LOW_ORDERS) * np.minimum(1.0, (LOW_ORDERS / np.maximum(order, 1)) ** 2)
+    total = share * np.hypot(step, slope * drive_step)
+    return total / 2 if total.any() else None
+
+
+def significant_lines(lines: np.ndarray, residue: np.ndarray, periods: int, step: float = 0.0):
     """Drive lines above their noise, others zero; and the rms of the noise.
 
-    The noise of a line is that of the quieter half of all lines: a raw noisy current would feed its noise to the model.
+    The noise of a line is that of the quieter half of all lines: a raw noisy current would feed its noise to the model;
+    `step`: rms of the converter's rounding, below which a line is the converter's own.
     """
     power = np.abs(lines) ** 2
     floor = np.median(power[len(power) // 2 :]) / np.log(2) if len(power) > 8 else 0.0
     if periods > 1 and len(residue) > 8:
         floor = max(floor, np.mean(residue**2) / len(residue))
-    keep = power > 25 * floor + 1e-10 * power[1:].max()
+    keep = power > 25 * floor + 1e-10 * power[1:].max() + step**2
     keep[:2] = True
     return np.where(keep, lines, 0.0), float(np.sqrt(floor * len(residue)))
 
@@ -189,4 +222,24 @@ def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
         away = np.abs(np.arange(count) * spectrum.frequency - spectrum.hum[0])
         left = np.where(away < 0.6 * lowest, 1.0, 0.25 * np.minimum(1.0, lowest / (np.pi * np.maximum(away, lowest))))
         variance = variance + (left * spectrum.hum[1]) ** 2 / 4
-    return np.sqrt(np.where(np.arange(count) == 0, variance, 0.5 * variance))
+    variance = np.where(np.arange(count) == 0, variance, 0.5 * variance)
+    return np.sqrt(variance if spectrum.systematic is None else variance + spectrum.systematic**2)
+
+
+def gain_rows(spectra, deviations):
+    """The whitening of uncertain scales: unit direction of each recording's whitened reading, and what to take off.
+
+    Relative errors g of the scales, whose mean over the recordings is zero by convention (the first of all scales is the
+    bench's word), add U G U' to the covariance, G = g_i g_j (1_ij - 1/n). Its inverse root acts on the components along the
+    readings alone: (recordings, lines) complex, and the matrix I - C^(-1/2), (recordings, recordings).
+    """
+    rows, sizes = [], []
+    for s, deviation in zip(spectra, deviations, strict=True):
+        row = s.reading[: len(deviation)] / deviation
+        row[0] = row[0].real
+        sizes.append(np.sqrt(np.sum(np.abs(row) ** 2)))
+        rows.append(row / max(sizes[-1], 1e-300))
+    n = len(rows)
+    spread = np.asarray([s.gain_accuracy for s in spectra]) * np.asarray(sizes)
+    values, vectors = np.linalg.eigh(np.eye(n) + spread[:, None] * (np.eye(n) - 1 / n) * spread)
+    return np.stack(rows), np.eye(n) - (vectors / np.sqrt(values)) @ vectors.T

@@ -132,7 +132,7 @@ def equation_error_start(basis, spectra, deviations, actuator, solve, max_freque
     A, b = A / tolerance, b / tolerance
     n = basis.unknowns
     normal, gradient = A.T @ A, -A.T @ b
-    for weight, D in zip((3.0, 3.0, 30.0), basis.penalties, strict=True):
+    for weight, D in zip((3.0, 3.0, 30.0, 3.0), basis.penalties, strict=False):
         normal[:n, :n] += weight * D.T @ D
     normal += 1e-8 * np.trace(normal) / len(normal) * np.eye(n + 1)
     solution = np.asarray(solve(normal, gradient, np.zeros(n + 1), np.arange(n + 1) < n))

@@ -22,7 +22,7 @@ OTHER_KEYS = {
     "limits": ("current_A", "field_A_per_m"),
     "fit": ("free", "output", "priors"),
 }
-COLUMN_KEYS = ("name", "scale", "offset", "unit", "split", "merge", "quasistatic", "emf_turns", "emf_area", "emf_sign")
+COLUMN_KEYS = ("name", "scale", "offset", "unit", "split", "merge", "quasistatic", "emf_turns", "emf_area", "emf_sign", "bits", "gain_accuracy")
 QUANTITIES = ("time", "current", "field", "displacement", "flux_density", "magnetization", "voltage", "temperature")
 STARTS = ("auto", "demagnetized", "negative_saturation", "positive_saturation")
 
@@ -136,6 +136,11 @@ def _build(content, path) -> Bench:
     for name in free:
         if name not in known_free:
             raise ConfigurationError(f'bench {path}: fit.free names "{name}"{_suggest(str(name), known_free)}')
+    for quantity, column in content.get("columns", {}).items():
+        for key, top in (("bits", 32), ("gain_accuracy", 0.5)):
+            value = column.get(key, 1)
+            if key in column and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= top):
+                raise ConfigurationError(f"bench {path}: columns.{quantity}.{key} = {value!r}; give a number above 0 and up to {top}")
     priors = {str(k): float(v) for k, v in fit.get("priors", {}).items()}
     return Bench(
         content.get("name", path.stem), present, constants, drive, output, content.get("columns", {}), free,

@@ -8,7 +8,8 @@ import numpy as np
 
 from .bench import load_bench
 from .errors import ConfigurationError, MagjaxError, RecordingError
-from .recording import Recording, fundamental
+from .pickup import bridge_gaps, integrate_emf, merge_captures
+from .recording import Recording
 
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
@@ -162,44 +163,11 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
     else:
         parts = [(path.name, np.ones(len(next(iter(table.values()))), bool))]
     if bench.columns.get("time", {}).get("merge"):
-        columns = merge_captures([{q: v[rows] for q, v in columns.items()} for _, rows in parts], bench, path)
+        columns, filled = merge_captures([{q: v[rows] for q, v in columns.items()} for _, rows in parts], bench, path)
+        if filled:
+            origin = {**origin, "metadata": {**origin["metadata"], "bridged_samples": filled}}
         return [_one(path.name, columns, origin, bench)]
     return [_one(name, {q: v[rows] for q, v in columns.items()}, origin, bench) for name, rows in parts]
-
-
-def merge_captures(captures, bench, path) -> dict:
-    """Repeated captures of one periodic run, not aligned, as one record: whole periods cut at the drive's phase.
-
-    Each capture's gaps are bridged, its phase is read off the drive's fundamental, and its whole periods are resampled
-    to a common grid (linear). A pick-up coil's emf loses its mean in each period, so that its integral closes.
-    """
-    parts, frequencies = [], []
-    for capture in captures:
-        time, channels, _ = bridge_gaps(capture["time"] - capture["time"][0], {q: v for q, v in capture.items() if q != "time"}, bench.drive)
-        dt = float(np.median(np.diff(time)))
-        f = fundamental(channels[bench.drive], dt)
-        if f is None:
-            raise RecordingError(f"{path}: a capture's {bench.drive} does not repeat; merge needs periodic captures (columns.time.merge)")
-        parts.append((dt, len(time), channels))
-        frequencies.append(f)
-    f = float(np.median(frequencies))
-    per = int(round(1 / (f * parts[0][0])))
-    merged = {q: [] for q in parts[0][2]}
-    for dt, count, channels in parts:
-        t = dt * np.arange(count)
-        angle = 2 * np.pi * f * t
-        design = np.stack([np.ones(count), np.cos(angle), np.sin(angle)], axis=1)
-        _, a, b = np.linalg.lstsq(design, channels[bench.drive], rcond=None)[0]
-        start = (np.arctan2(b, a) / (2 * np.pi)) % 1.0 / f  # the drive's crest
-        whole = int(np.floor((t[-1] - start) * f))
-        at = start + np.arange(whole * per) / (per * f)
-        for q, values in channels.items():
-            periods = np.interp(at, t, values).reshape(whole, per)
-            if "emf_turns" in bench.columns.get(q, {}):
-                periods = periods - periods.mean(axis=1, keepdims=True)
-            merged[q].append(periods.ravel())
-    joined = {q: np.concatenate(v) for q, v in merged.items()}
-    return {"time": np.arange(len(joined[bench.drive])) / (per * f), **joined}
 
 
 def _find(path, table, quantity, column, required):
@@ -259,43 +227,6 @@ def _one(name, columns, origin, bench) -> Recording:
     return recording
 
 
-def bridge_gaps(time, channels, drive, most: float = 0.1):
-    """Fill missing samples of a periodic run from the harmonics that fit the rest; (time, channels, samples filled).
-
-    Only where the steps are whole multiples of the usual one, the drive repeats at least twice, and less than `most`
-    of the samples are missing; else everything is returned as it is, and `Recording` says where the gap lies.
-    """
-    steps = np.diff(time)
-    dt = np.median(steps)
-    if not dt > 0 or len(time) < 64 or not all(np.all(np.isfinite(v)) for v in channels.values()):
-        return time, channels, 0
-    multiples = np.round(steps / dt)
-    if multiples.max() < 2 or multiples.min() < 1 or np.abs(steps / dt - multiples).max() > 0.1:
-        return time, channels, 0
-    index = np.concatenate([[0], np.cumsum(multiples)]).astype(int)
-    full = np.arange(index[-1] + 1)
-    missing = np.setdiff1d(full, index)
-    if len(missing) > most * len(full):
-        return time, channels, 0
-    f = fundamental(np.interp(full, index, channels[drive]), dt)
-    if f is None or len(full) * dt * f < 2:
-        return time, channels, 0
-    orders = np.arange(1, min(40, int(0.4 / (f * dt))) + 1)
-
-    def design(at):
-        angle = 2 * np.pi * f * dt * np.outer(orders, at)
-        return np.concatenate([np.ones((1, len(at))), np.cos(angle), np.sin(angle)])
-
-    known, wanted = design(index), design(missing)
-    filled = {}
-    for quantity, values in channels.items():
-        coefficients = np.linalg.lstsq(known.T, values, rcond=None)[0]
-        whole = np.empty(len(full))
-        whole[index], whole[missing] = values, coefficients @ wanted
-        filled[quantity] = whole
-    return dt * full, filled, len(missing)
-
-
 def _si(quantity):
     return next(iter(UNITS[quantity]))
 
@@ -350,21 +281,3 @@ def _uniform_loop(columns, bench):
     start = ahead[np.argmax(x)]
     place = (start + travelled * (total / (2 * (top - bottom)))) % total
     return {bench.drive: np.interp(place, ahead, x), bench.output: np.interp(place, ahead, y)}
-
-
-def integrate_emf(emf, drive, dt, column):
-    """Flux density from a pick-up coil's emf = -N A dB/dt (sign from the bench), T.
-
-    The offset is the mean over whole periods; what is integrated has no mean, so B has no drift; B has zero mean.
-    """
-    f = fundamental(np.asarray(drive, float), dt)
-    rate = float(column.get("emf_sign", -1)) * np.asarray(emf, float) / (float(column["emf_turns"]) * float(column["emf_area"]))
-    n = len(rate)
-    whole = n if f is None else int(round(max(1, np.floor(n * dt * f + 1e-6)) / (f * dt)))
-    whole = min(whole, n)
-    rate = rate - rate[:whole].mean()
-    B = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * dt)])
-    # what the ends of the whole periods differ by is drift
-    last = min(whole, n - 1)
-    B = B - (B[last] - B[0]) / (last * dt) * dt * np.arange(n) if f is not None and last > 0 else B
-    return B - B[:whole].mean()

@@ -41,9 +41,10 @@ def require_x64():
         raise ConfigurationError('double precision is off; run jax.config.update("jax_enable_x64", True) before anything else')
 
 
-def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str) -> Signals:
+def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str | None = None) -> Signals:
     """The chain as a pure function for `jit`, `vmap` and derivatives. `periods` = 0: not periodic; else run so many
-    and return the last."""
+    and return the last. `scheme`: of the coupled step, the coil's own if None."""
+    scheme = scheme or actuator.coil.scheme
     count = command.shape[0]
     periodic = periods > 0
     line = Timeline(jnp.asarray(dt, dtype=float), count, periodic)
@@ -89,7 +90,7 @@ def finish_chain(actuator, line, command, current, H, M, v, residual, overflow) 
 _run = eqx.filter_jit(run_chain)
 
 
-def simulate(actuator, current, dt: float, *, periodic: bool = False, settle: int = 3, corners=None, scheme="trapezoid") -> Signals:
+def simulate(actuator, current, dt: float, *, periodic: bool = False, settle: int = 3, corners=None, scheme=None) -> Signals:
     """Simulate the actuator.
 
     `current`: (time,), A (applied field, A/m, on a field-driven bench). `dt`: s. `periodic`: the samples are one period
@@ -185,7 +186,7 @@ def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, corne
     phase = 2 * jnp.pi * jnp.arange(samples) / samples
 
     def one(f, A, b):
-        signals = run_chain(actuator, b + A * jnp.sin(phase), 1 / (f * samples), periods, corners, "trapezoid")
+        signals = run_chain(actuator, b + A * jnp.sin(phase), 1 / (f * samples), periods, corners)
         y = signals.reading
         tone = 2 * jnp.mean(y * jnp.exp(-1j * phase)) * 1j
         applied = actuator.coil.applied_field(signals.current)

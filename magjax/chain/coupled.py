@@ -24,7 +24,8 @@ from ..errors import ConfigurationError
 from ..preisach.memory import Memory, apply_field, branch_magnetization
 
 SCHEMES = ("bdf2", "trapezoid")
-NEWTON_STEPS = 12
+CLOSE_ENOUGH = 1e-12  # of half the plane; the polish squares what is left
+MOST_STEPS = 60  # a bisection alone gets there
 
 
 class _Carry(eqx.Module):
@@ -177,6 +178,9 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
         states = tuple(e.advance(trial, s, actuator) for e, s in zip(effects, c.states, strict=True))
         H, M = v + extra[1], m + extra[2]
         residual = p * v + q * m + extra[0] - rhs
+        if effects:  # the relays' own M at that field, so that a step that did not settle shows
+            own, _, threshold, m_there = c.memory.branch(table, v)
+            residual = residual + (branch_magnetization(table, own, threshold, m_there, v) - m)
         return _Carry(memory, H + M, c.X0, H, applied1, states, residual), (H, M, v, residual)
 
     carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:]))
@@ -210,15 +214,19 @@ def _solve_with_effects(table, c, effects, actuator, trial_at, p, q, rhs):
     v0, m0, *_ = solve_branch(frozen_table, frozen_c.memory, pf, qf, rf)
     reach = 0.5 * frozen_table.step * frozen_table.cells
 
-    def refine(_, bracket):
-        v, lo, hi = bracket
+    def refine(bracket):
+        v, lo, hi, _, number = bracket
         (value, _), (slope, _) = jax.jvp(excess, (v,), (jnp.ones_like(v),))
         lo, hi = jnp.where(value <= 0, v, lo), jnp.where(value > 0, v, hi)
         newton = v - value / jnp.where(slope > 0, slope, pf)
         inside = (newton > lo) & (newton < hi) & (slope > 0)
-        return jnp.where(value == 0, v, jnp.where(inside, newton, 0.5 * (lo + hi))), lo, hi
+        new = jnp.where(value == 0, v, jnp.where(inside, newton, 0.5 * (lo + hi)))
+        return new, lo, hi, jnp.abs(new - v), number + 1
 
-    v, _, _ = jax.lax.fori_loop(0, NEWTON_STEPS, refine, (v0, v0 - reach, v0 + reach))
+    def unsettled(bracket):
+        return (bracket[3] > CLOSE_ENOUGH * reach) & (bracket[4] < MOST_STEPS)
+
+    v, *_ = jax.lax.while_loop(unsettled, refine, (v0, v0 - reach, v0 + reach, reach, 0))
     v = stop_gradient(v)
     frozen_extra = stop_gradient(excess(v)[1])
     v, m, rising, kept = solve_branch(frozen_table, frozen_c.memory, pf, qf, rf - frozen_extra)
