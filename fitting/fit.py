@@ -16,6 +16,7 @@ from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 FINER_KNOTS = ((26, 18), (36, 24))
 REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
+REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
 def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None) -> FitResult:
@@ -46,7 +47,8 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
     """Finer hats where chi2 stays above the noise and they lower it clearly."""
     count = problem.data_count
     for knots in FINER_KNOTS:
-        if not REFINE_BETWEEN[0] < solution.chi2 / count < REFINE_BETWEEN[1]:
+        highest = REFINE_MATERIAL if bench.drive == "field" else REFINE_BETWEEN[1]
+        if not REFINE_BETWEEN[0] < solution.chi2 / count < highest:
             break
         finer = dataclasses.replace(choices, knots=knots, level=max(choices.level, 4 * knots[0]))
         started = _resample(problem, solution, spectra, actuator, bench, names, finer)
