@@ -1,8 +1,8 @@
 """The density as the fit sees it: hats on knots in mean field and coercive field, nonnegative, with roughness penalties.
 
 Coordinates s = (alpha + beta)/2 and r = (alpha - beta)/2; knots uniform in s and dense near r = 0 (r = R u^1.6).
-One column of cells below every recorded field is kept apart: its relays switch up once and stay, which lets the
-level of M depend on a recording's highest field without asking for its past.
+One column of cells below every recorded field and one row above are kept apart: their relays switch once and stay, which
+lets the level of M depend on a recording's highest and lowest field without asking for the whole past.
 """
 
 import dataclasses
@@ -14,9 +14,9 @@ R_EXPONENT = 1.6
 
 @dataclasses.dataclass(frozen=True)
 class DensityBasis:
-    """masses = total * (cells @ x) on an (L+1) x (L+1) plane whose column 0 holds the once-switching relays.
+    """masses = total * (cells @ x) on an (L+2) x (L+2) plane whose column 0 and last row hold the once-switching relays.
 
-    `low`, `high`: range of that plane, A/m; `cells`: ((L+1)^2, unknowns), unit-free; `penalties`: one matrix of
+    `low`, `high`: range of that plane, A/m; `cells`: ((L+2)^2, unknowns), unit-free; `penalties`: one matrix of
     second differences per family (along s, along r, along the once-switching column); `total`: A/m;
     `flat`: the unknowns of a uniform density of mass `total`.
     """
@@ -37,7 +37,7 @@ class DensityBasis:
         return self.cells.shape[1]
 
     def masses(self, x) -> np.ndarray:
-        """The (L+1, L+1) mass array, A/m."""
+        """The (L+2, L+2) mass array, A/m."""
         return (self.total * (self.cells @ np.asarray(x))).reshape(self.size, self.size)
 
 
@@ -48,7 +48,7 @@ def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: i
     diagonal alone: a part without hysteresis, which hats in r can only make as a spike that their penalty resists.
     """
     step = (high - low) / level
-    size, refine = level + 1, 4
+    size, refine = level + 2, 4
     points = low + step * (np.arange(level * refine) + 0.5) / refine
     alpha, beta = np.meshgrid(points, points, indexing="ij")
     inside = alpha >= beta
@@ -73,30 +73,36 @@ def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: i
     columns = [c / area for c in columns]
     main = len(columns)
     once = _hats(low + step * (np.arange(level) + 0.5), np.linspace(low, high, max(6, knots_s // 2)))
-    for k in range(once.shape[1]):
-        mass = np.zeros((size, size))
-        mass[1:, 0] = once[:, k] / level
-        columns.append(mass.ravel())
+    for place in ((slice(1, -1), 0), (-1, slice(1, -1))):
+        for k in range(once.shape[1]):
+            mass = np.zeros((size, size))
+            mass[place] = once[:, k] / level
+            columns.append(mass.ravel())
     once_end = len(columns)
     for k in range(knots_s if reversible else 0):
         on_diagonal = np.diag(_hats(low + step * (np.arange(level) + 0.5), s_knots)[:, k] / level)
-        columns.append(np.pad(on_diagonal, ((1, 0), (1, 0))).ravel())
+        columns.append(np.pad(on_diagonal, 1).ravel())
     cells = np.stack(columns, axis=1)
     penalties = [
         _differences([[number.get((a + d, b)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
         _differences([[number.get((a, b + d)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
-        _differences([[main + k - 1, main + k, main + k + 1] for k in range(1, once.shape[1] - 1)], cells.shape[1], ridge=range(main, once_end)),
+        _differences(_triples(main, once.shape[1]) + _triples(main + once.shape[1], once.shape[1]), cells.shape[1], ridge=range(main, once_end)),
     ]
     if reversible:
-        penalties.append(_differences([[once_end + k - 1, once_end + k, once_end + k + 1] for k in range(1, knots_s - 1)], cells.shape[1]))
+        penalties.append(_differences(_triples(once_end, knots_s), cells.shape[1]))
     flat = np.ones(cells.shape[1])
     flat[main:] = 0.05
-    return DensityBasis(low - step, high, size, cells, tuple(penalties), total, flat, knots_s, knots_r)
+    return DensityBasis(low - step, high + step, size, cells, tuple(penalties), total, flat, knots_s, knots_r)
 
 
 def _hats(x, knots):
     """Linear hat functions on knots, (points, knots)."""
     return np.stack([np.interp(x, knots, row) for row in np.eye(len(knots))], axis=1)
+
+
+def _triples(first, count):
+    """Neighbours of a row of `count` unknowns from number `first` on."""
+    return [[first + k - 1, first + k, first + k + 1] for k in range(1, count - 1)]
 
 
 def _differences(triples, unknowns, ridge=()):
@@ -116,7 +122,7 @@ def _differences(triples, unknowns, ridge=()):
 
 def cell_basis(low: float, high: float, total: float, level: int) -> DensityBasis:
     """One unknown a cell, the form of T&B Sec. 2.1, with the once-switching column; penalties along s and r."""
-    size = level + 1
+    size = level + 2
     number, columns = {}, []
     area = level * level / 2
     for i in range(level):
@@ -126,18 +132,19 @@ def cell_basis(low: float, high: float, total: float, level: int) -> DensityBasi
             number[i, j] = len(columns)
             columns.append(mass.ravel())
     main = len(columns)
-    for i in range(level):
-        mass = np.zeros((size, size))
-        mass[i + 1, 0] = 1.0 / level
-        columns.append(mass.ravel())
+    for column in (True, False):
+        for i in range(level):
+            mass = np.zeros((size, size))
+            mass[(i + 1, 0) if column else (-1, i + 1)] = 1.0 / level
+            columns.append(mass.ravel())
     cells = np.stack(columns, axis=1)
     along_s = [[number.get((i + d, j + d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
     along_r = [[number.get((i + d, j - d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
-    once = [[main + k - 1, main + k, main + k + 1] for k in range(1, level - 1)]
+    once = _triples(main, level) + _triples(main + level, level)
     penalties = tuple(
         _differences(t, cells.shape[1], ridge) for t, ridge in ((along_s, ()), (along_r, ()), (once, range(main, cells.shape[1])))
     )
     flat = np.ones(cells.shape[1])
     flat[main:] = 0.05
     step = (high - low) / level
-    return DensityBasis(low - step, high, size, cells, penalties, total, flat, level, level)
+    return DensityBasis(low - step, high + step, size, cells, penalties, total, flat, level, level)

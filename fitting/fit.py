@@ -16,6 +16,7 @@ from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 FINER_KNOTS = ((26, 18), (36, 24))
 REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
+REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
@@ -34,13 +35,39 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     spectra = spectra_of(recordings, bench, choices.harmonics)
     names = free_parameters(bench, actuator, extra)
     report = (lambda *a: None) if progress is None else progress
-    problem, z = build_problem(spectra, actuator, bench, names, choices, start)
+    problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), start)
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
-    solution = solve(problem, z, START_WEIGHTS[: len(problem.layout.penalties)], max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
+    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report)
     if refine and choices.knots is not None:
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report)
     return finish(problem, solution, choices, bench, recordings, warm)
+
+
+RESTS = {"negative_saturation": "negative", "demagnetized": "demagnetized", "positive_saturation": "positive"}
+
+
+def _rests(bench, choices):
+    """Start memories to try, in order."""
+    if choices.rest != "auto":
+        return (choices.rest,)
+    return (RESTS[bench.start],) if bench.start in RESTS else ("negative", "demagnetized", "positive")
+
+
+def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report):
+    """The fit from each start memory until one meets the noise; the best of them."""
+    best = None
+    for rest in _rests(bench, choices):
+        tried = dataclasses.replace(choices, rest=rest)
+        if best is not None:
+            problem, z = build_problem(spectra, actuator, bench, names, tried, start)
+        weights = START_WEIGHTS[: len(problem.layout.penalties)]
+        solution = solve(problem, z, weights, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
+        if best is None or solution.chi2 < best[1].chi2:
+            best = (problem, solution, tried)
+        if best[1].chi2 < REST_SETTLED * problem.data_count:
+            break
+    return best
 
 
 def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report):

@@ -62,12 +62,12 @@ class Solution:
 
 @eqx.filter_jit
 def _data_residual(layout, z, target, template, predictors):
-    return whitened(predictors[1](layout.actuator(template, z)), target)
+    return whitened(predictors[1](layout.actuator(template, z), layout.levels(z)), target)
 
 
 @eqx.filter_jit
 def _data_jacobian(layout, z, target, template, predictors):
-    return jacobian(lambda y: whitened(predictors[0](layout.actuator(template, y)), target), z)
+    return jacobian(lambda y: whitened(predictors[0](layout.actuator(template, y), layout.levels(y)), target), z)
 
 
 def data_residual(problem: Problem, z):

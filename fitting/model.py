@@ -17,9 +17,14 @@ from magjax.simulate import run_chain
 
 from .density import DensityBasis
 
+MEMORY = 3e-4  # of the total; prior deviation of each recording's level of M
+
 
 class Layout(eqx.Module):
-    """Order of the unknowns: [density, bottom of M / total, free physical parameters in the optimiser's coordinates].
+    """Order of the unknowns: [density, bottom of M / total, free physical parameters in the optimiser's coordinates,
+    level of M of each recording].
+
+    The last carry a tight prior (MEMORY of the total): what the start transient left in relays that later never switch.
 
     A parameter is start * exp(z) where it must stay positive (`log`), else start + scale * z. The arrays are traced,
     so that fits of the same shape share one compiled program.
@@ -32,13 +37,14 @@ class Layout(eqx.Module):
     scales: jax.Array
     names: tuple[str, ...] = eqx.field(static=True)
     log: tuple[bool, ...] = eqx.field(static=True)
+    memories: int = eqx.field(static=True, default=0)
 
     @staticmethod
-    def build(basis, names, starts, scales, log) -> "Layout":
+    def build(basis, names, starts, scales, log, memories: int = 0) -> "Layout":
         """From a density basis and the free parameters' names, start values, scales and coordinate kinds."""
         return Layout(
             jnp.asarray(basis.cells), tuple(jnp.asarray(D) for D in basis.penalties), jnp.asarray(basis.total),
-            jnp.asarray(starts, dtype=float), jnp.asarray(scales, dtype=float), tuple(names), tuple(log),
+            jnp.asarray(starts, dtype=float), jnp.asarray(scales, dtype=float), tuple(names), tuple(log), memories,
         )  # fmt: skip
 
     @property
@@ -49,7 +55,7 @@ class Layout(eqx.Module):
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return self.density_unknowns + 1 + len(self.names)
+        return self.density_unknowns + 1 + len(self.names) + self.memories
 
     @property
     def nonnegative(self) -> np.ndarray:
@@ -77,6 +83,10 @@ class Layout(eqx.Module):
         if self.log[k]:
             return float(np.log(value / self.starts[k]))
         return float((value - self.starts[k]) / self.scales[k])
+
+    def levels(self, z):
+        """What each recording's start transient adds to M, A/m, (recordings,) or None."""
+        return MEMORY * self.total * z[self.size - self.memories :] if self.memories else None
 
     def actuator(self, template, z):
         """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable)."""
@@ -134,15 +144,25 @@ class Predictor(eqx.Module):
             tuple(int(k) for k in order), harmonics, periods, corners,
         )  # fmt: skip
 
-    def __call__(self, actuator):
-        """Complex Fourier coefficients 0..harmonics of the reading, (recordings, harmonics + 1)."""
+    def __call__(self, actuator, levels=None):
+        """Complex Fourier coefficients 0..harmonics of the reading, (recordings, harmonics + 1).
 
-        def one(drive, dt):
-            signals = run_chain(actuator, drive, dt, self.periods, self.corners)
+        `levels`: what is added to M in each recording, A/m, (recordings,).
+        """
+
+        def one(drive, dt, level):
+            shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
+            signals = run_chain(shifted, drive, dt, self.periods, self.corners)
             return jnp.fft.rfft(signals.reading)[: self.harmonics + 1] / drive.shape[0]
 
-        parts = [jax.vmap(one)(drive, dt) for drive, dt in zip(self.drives, self.steps, strict=True)]
-        return jnp.concatenate(parts)[np.asarray(self.index)]
+        order = np.asarray(self.index)
+        levels = jnp.zeros(len(order)) if levels is None else levels
+        levels = levels[np.argsort(order)]  # as the grids hold the recordings
+        parts, at = [], 0
+        for drive, dt in zip(self.drives, self.steps, strict=True):
+            parts.append(jax.vmap(one)(drive, dt, levels[at : at + drive.shape[0]]))
+            at += drive.shape[0]
+        return jnp.concatenate(parts)[order]
 
 
 class Target(eqx.Module):
@@ -172,7 +192,7 @@ def prior_rows(layout: Layout, z, target: Target):
     return jnp.concatenate([*rows, target.priors * z[n + 1 :], target.bottom_prior * z[n : n + 1]])
 
 
-def make_start_actuator(template, basis: DensityBasis):
+def make_start_actuator(template, basis: DensityBasis, rest=None):
     """`template` with a plane that fits the basis (uniform masses)."""
-    hysteresis = Preisach(basis.masses(basis.flat), basis.low, basis.high, 0.0)
+    hysteresis = Preisach(basis.masses(basis.flat), basis.low, basis.high, 0.0, rest=rest)
     return eqx.tree_at(lambda a: a.hysteresis, template, hysteresis)

@@ -104,7 +104,7 @@ def model_as_dict(actuator, bench) -> dict:
         "effects": [e.name for e in actuator.effects],
         "hysteresis": {
             "low": float(hysteresis.low), "high": float(hysteresis.high), "offset": float(hysteresis.offset),
-            "history": np.asarray(hysteresis.history).tolist(), "masses": np.asarray(hysteresis.masses).tolist(),
+            "rest": float(hysteresis.rest), "history": np.asarray(hysteresis.history).tolist(), "masses": np.asarray(hysteresis.masses).tolist(),
         },
     }  # fmt: skip
 

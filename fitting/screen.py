@@ -156,6 +156,7 @@ def _march_columns(predictor, actuator, effects, directions):
             memory = changed.hysteresis.memory(table, predictor.corners)
             whole_drive = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (applied, current)]
             H, M, v, res, over = magnetize(changed, *whole_drive, dt, memory, changed.coil.scheme)
+            M = M + changed.hysteresis.unreached(jnp.max(v), jnp.min(v))
             H, M, v, res = (x[-count - 1 : -1] for x in (H, M, v, res))
             s = finish_chain(changed, line, drive, current, H, M, v, res, over)
             return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / count
@@ -223,7 +224,7 @@ class Projector:
         for w, D in zip(UNDERSMOOTH * solution.weights, layout.penalties, strict=True):
             rows.append(np.sqrt(w) * np.asarray(D))
             leftover.append(rows[-1] @ z[:n])
-        prior = np.zeros((sum(len(r) for r in rows) + len(layout.names), len(z)))
+        prior = np.zeros((sum(len(r) for r in rows) + len(z) - n - 1, len(z)))
         at = 0
         for r in rows:
             prior[at : at + len(r), :n] = r

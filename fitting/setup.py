@@ -34,7 +34,7 @@ class Choices:
     periods: int = 3
     harmonics: int = HARMONICS
     max_jacobians: int = 30
-    sensor_offset: bool = False
+    rest: str = "auto"  # start memory: "negative", "demagnetized" about the drive's zero, "positive", or tried in turn
 
 
 def spectra_of(recordings, bench, harmonics: int = HARMONICS):
@@ -83,6 +83,8 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         crowd = 1.7 if bench.drive == "field" else 1.0
         level = 2 * choices.level if bench.drive == "field" else choices.level
         basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive == "field")
+    zero = float(np.asarray(actuator.coil.applied_field(jnp.asarray(0.0))))
+    rest = {"demagnetized": float(np.clip(zero, basis.low, basis.high)), "positive": basis.high}.get(choices.rest, basis.low)
     harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
     deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
     full = [line_deviations(s, s.noise) for s in spectra]
@@ -92,14 +94,15 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
         actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})
     if start is None:
-        x, bottom, _ = equation_error_start(basis, spectra, full, starter, jax.jit(bounded_step))
+        x, bottom, _ = equation_error_start(basis, spectra, full, starter, jax.jit(bounded_step), rest=rest)
         start = np.append(x, bottom)
     known = actuator.parameters()
     values = [float(known[n][0]) for n in names]
     infos = [known[n][1] for n in names]
     log = [i.low >= 0 and v > 0 and (i.null is None or i.shape) for i, v in zip(infos, values, strict=True)]
     scales = [i.scale for i in infos]
-    layout = Layout.build(basis, names, values, scales, log)
+    memories = len(spectra) if actuator.output == "displacement" else 0
+    layout = Layout.build(basis, names, values, scales, log, memories)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners = int(4 * np.ceil(corners / 4))
     # a narrow loop under a strong field turns within a few samples
@@ -110,14 +113,14 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     deviations = np.stack(deviations)
     if actuator.output == "flux_density":  # an integrated emf has no mean
         deviations[:, 0] = np.inf
-    priors = np.asarray([_prior(bench, *row) for row in zip(names, values, log, infos, strict=True)])
+    priors = np.asarray([_prior(bench, *row) for row in zip(names, values, log, infos, strict=True)] + [1.0] * memories)
     rows, shares = gain_rows(spectra, deviations)
     target = Target(
         jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS[: len(basis.penalties)]), jnp.asarray(priors), jnp.asarray(1e-3),
         jnp.asarray(rows), jnp.asarray(shares),
     )  # fmt: skip
-    problem = Problem(layout, make_start_actuator(actuator, basis), predictors, target, tuple(spectra), _quasistatic(bench))
-    return problem, np.concatenate([start, np.zeros(len(names))])
+    problem = Problem(layout, make_start_actuator(actuator, basis, rest), predictors, target, tuple(spectra), _quasistatic(bench))
+    return problem, np.concatenate([start, np.zeros(len(names) + memories)])
 
 
 def _quasistatic(bench) -> bool:

@@ -7,6 +7,7 @@ then linear in the masses: nonnegative least squares with the roughness penaltie
 import numpy as np
 
 from magjax.constants import MU0
+from magjax.preisach.operator import unreached_share
 
 from .spectra import evaluate_lines
 
@@ -62,6 +63,16 @@ def operator_rows(basis, field: np.ndarray, history=()) -> np.ndarray:
     return total[np.asarray(samples)][len(history) :]
 
 
+def unreached_row(basis, highest, lowest, rest):
+    """What every basis function adds to M through relays that a drive leaves up, as `Preisach.unreached`: (unknowns,)."""
+    if rest is None or rest <= basis.low:
+        return np.zeros(basis.unknowns)
+    step = (basis.high - basis.low) / basis.size
+    edge = (basis.low - rest) / step + np.arange(basis.size + 1)
+    share = unreached_share(edge, (highest - rest) / step, (lowest - rest) / step, np)
+    return 2 * (np.tril(share) * (1 + np.eye(basis.size))).ravel() @ basis.cells
+
+
 def inferred_loops(spectra, deviations, actuator, samples: int = 200):
     """Field and magnetization over a period from the reading, by (4) and (5) backwards: lists of (H, M, trust)."""
     loops = []
@@ -112,10 +123,11 @@ def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
     return changed if turns.sum() % 2 == 0 and against(changed) < against(root) else root
 
 
-def equation_error_start(basis, spectra, deviations, actuator, solve, max_frequency=None):
+def equation_error_start(basis, spectra, deviations, actuator, solve, max_frequency=None, rest=None):
     """Density unknowns and the bottom of M from the slower half of the recordings: (x, bottom / total, misfit).
 
     `max_frequency`: take all recordings (any value but None). `misfit`: rms of the weighted equation error, relative.
+    `rest`: field about which the material was demagnetized, A/m; None for negative saturation.
     """
     order = np.argsort([s.frequency for s in spectra])
     chosen = order[: max(2, (len(order) + 1) // 2)] if max_frequency is None else order
@@ -123,8 +135,9 @@ def equation_error_start(basis, spectra, deviations, actuator, solve, max_freque
     loops = inferred_loops(spectra, [deviations[k] for k in chosen], actuator)
     rows, values = [], []
     for H, M, trust in loops:
-        H = np.clip(H, basis.low + (basis.high - basis.low) / basis.size, basis.high)
-        Phi = operator_rows(basis, np.tile(H, 2))[len(H) :]
+        step = (basis.high - basis.low) / basis.size
+        H = np.clip(H, basis.low + step, basis.high - step)
+        Phi = operator_rows(basis, np.tile(H, 2))[len(H) :] + unreached_row(basis, H.max(), H.min(), rest)
         rows.append(np.column_stack([Phi, np.ones(len(H))]) * trust[:, None])
         values.append(M / basis.total * trust)
     A, b = np.concatenate(rows), np.concatenate(values)

@@ -28,7 +28,7 @@ def load_model(folder):
     bench = Bench(**stated)
     actuator = bench.actuator()
     plane = content["hysteresis"]
-    hysteresis = Preisach(np.asarray(plane["masses"]), plane["low"], plane["high"], plane["offset"])
+    hysteresis = Preisach(np.asarray(plane["masses"]), plane["low"], plane["high"], plane["offset"], rest=plane.get("rest"))
     hysteresis = eqx.tree_at(lambda h: h.history, hysteresis, jnp.asarray(plane["history"], dtype=float))
     actuator = eqx.tree_at(lambda a: a.hysteresis, actuator, hysteresis)
     classes = {e.name: e for e in CATALOGUE}

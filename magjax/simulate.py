@@ -3,6 +3,7 @@
 Current (A) or applied field (A/m) in, every signal of the chain out, SI. Periodic drives end in their steady state.
 """
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -57,7 +58,9 @@ def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str | N
     if periodic:
         whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (applied, current)]
         parts = magnetize(actuator, *whole, line.dt, memory, scheme)
+        M_unreached = actuator.hysteresis.unreached(jnp.max(parts[2][-count:]), jnp.min(parts[2][-count:]))
         H, M, v, residual = (x[-count - 1 : -1] for x in parts[:4])
+        M = M + M_unreached
     else:
         parts = magnetize(actuator, applied, current, line.dt, memory, scheme)
         H, M, v, residual = parts[:4]
@@ -112,6 +115,8 @@ def simulate(actuator, current, dt: float, *, periodic: bool = False, settle: in
         raise ConfigurationError(f"the drive has a NaN or infinity at sample {int(np.argmin(np.isfinite(drive)))}; mend it first")
     if not dt > 0:
         raise ConfigurationError(f"dt = {dt} s; the time step must be positive")
+    if not periodic:
+        actuator = dataclasses.replace(actuator, hysteresis=actuator.hysteresis.rested())
     needed = _corners(actuator, drive, periodic) if corners is None else corners
     signals = _run(actuator, jnp.asarray(drive), dt, (settle + 1) if periodic else 0, needed, scheme)
     if bool(signals.overflow):

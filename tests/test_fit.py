@@ -77,7 +77,7 @@ def test_interrupt_keeps_what_was_reached(recordings, bench):
 def test_one_unknown_a_cell(recordings, bench):
     got = fit(recordings, bench, choices=dataclasses.replace(QUICK, knots=None, level=25), refine=False)
     assert abs(got.estimate("coil.R_eddy").value / 62 - 1) < 0.05
-    assert got.actuator.hysteresis.cells == 26
+    assert got.actuator.hysteresis.cells == 27
 
 
 def test_aperiodic_drive_is_refused_with_the_mend(bench, recordings):

@@ -41,7 +41,7 @@ class PlainActuator:
         """From any object with the attributes of `magjax.actuator.Actuator`."""
         if getattr(actuator, "mechanics", None) is None or not hasattr(actuator.coil, "R_eddy"):
             raise ConfigurationError("only a current-driven bench with mechanics can be inverted for a displacement")
-        h, c, m, s = actuator.hysteresis, actuator.coil, actuator.magnetostriction, actuator.mechanics
+        h, c, m, s = actuator.hysteresis.rested(), actuator.coil, actuator.magnetostriction, actuator.mechanics
         operator = PlainPreisach(np.asarray(h.masses), float(h.low), float(h.high), float(h.offset), np.asarray(h.history))
         effects = {e.name: {p: float(np.asarray(getattr(e, p))) for p in e.parameters()} for e in actuator.effects}
         numbers = (c.R_eddy, c.c0, c.H_bias, c.N_m, c.A_m, m.lambda_s, m.M_s, m.l_rod, s.f0, s.xi)

@@ -19,21 +19,39 @@ from .memory import apply_field, memory_after, start_history
 from .relays import relay_magnetization
 
 
+def unreached_share(edge, highest, lowest, xp):
+    """Area of {alpha > highest, beta < lowest, alpha + beta < 0} in every cell of unit side, (L, L).
+
+    `edge`: the L + 1 levels and `highest`, `lowest` relative to the field of rest, in cells; `xp`: NumPy or jax.numpy.
+    """
+    x0, x1 = xp.clip(highest, edge[:-1], edge[1:])[:, None], edge[1:, None]
+    y0, y1 = edge[None, :-1], xp.clip(lowest, edge[:-1], edge[1:])[None, :]
+
+    def corner(x, y):
+        return 0.5 * xp.maximum(-x - y, 0.0) ** 2
+
+    return corner(x0, y0) - corner(x1, y0) - corner(x0, y1) + corner(x1, y1)
+
+
 class Preisach(eqx.Module):
     """A Preisach operator at discretization level L.
 
     `masses`: (L, L), A/m, [alpha row, beta column], zero above the diagonal; M runs between `offset` - sum and
     `offset` + sum. `low`, `high`: range of the plane, A/m. `start`: the state before the drive, kept as the history of
     fields that makes it: "negative_saturation", "positive_saturation", "demagnetized" or an array of fields, A/m.
+    `rest`: the field about which the material was demagnetized before, A/m: relays that the drive never reaches stay up
+    where alpha + beta < 2 rest. `low` (the default) is negative saturation, `high` positive; differentiable, so it can be
+    fitted; it enters steady states as `unreached` and other runs through `rested`.
     """
 
     masses: Float[Array, "L L"]
     low: Float[Array, ""]
     high: Float[Array, ""]
-    offset: Float[Array, ""] 
+    offset: Float[Array, ""]
+    rest: Float[Array, ""]
     history: Float[Array, " extrema"]
 
-    def __init__(self, masses, low, high, offset=0.0, start="negative_saturation"):
+    def __init__(self, masses, low, high, offset=0.0, start="negative_saturation", rest=None):
         masses = as_float_array(masses)
         if masses.ndim != 2 or masses.shape[0] != masses.shape[1]:
             raise ConfigurationError(f"hysteresis.masses must be L x L (alpha rows, beta columns), not {masses.shape}")
@@ -44,6 +62,7 @@ class Preisach(eqx.Module):
             raise ConfigurationError(f"the Preisach plane {low}..{high} A/m is empty; give low < high")
         self.masses = masses
         self.low, self.high, self.offset = as_float_array(low), as_float_array(high), as_float_array(offset)
+        self.rest = self.low if rest is None else as_float_array(rest)
         self.history = as_float_array(start_history(start, float(low), float(high)))
 
     @property
@@ -55,6 +74,25 @@ class Preisach(eqx.Module):
     def levels(self):
         """The L + 1 thresholds between cells, A/m."""
         return self.low + (self.high - self.low) * jnp.arange(self.cells + 1) / self.cells
+
+    def unreached(self, highest, lowest):
+        """What M gains over a start in negative saturation by relays that a drive between two fields leaves up, A/m."""
+        step = (self.high - self.low) / self.cells
+        edge = (self.levels - self.rest) / step
+        share = unreached_share(edge, (highest - self.rest) / step, (lowest - self.rest) / step, jnp)
+        density = jnp.tril(self.masses) * (1.0 + jnp.eye(self.cells))  # a diagonal cell is half a square
+        return jnp.where(self.rest > self.low, 2 * jnp.sum(density * share), 0.0)
+
+    def rested(self, alternations: int = 24) -> "Preisach":
+        """The same operator with `rest` written out as a decaying history, for runs that are not periodic."""
+        low, high, rest = float(self.low), float(self.high), float(self.rest)
+        if rest <= low:
+            return self
+        heights = max(rest - low, high - rest) * (1 - np.arange(alternations) / alternations)
+        history = np.append(np.clip(rest + heights * (-1.0) ** np.arange(alternations), low, high), rest)
+        history = np.append(history, np.asarray(self.history))
+        made = Preisach(self.masses, self.low, self.high, self.offset, history if rest < high else np.append(high, np.asarray(self.history)))
+        return made
 
     def table(self):
         """The Everett table that steps read."""
