@@ -89,3 +89,24 @@ def _story(plain, found, folder) -> str:
         rows.append(f"  {name:28s} {true:10.5g} {before} " + (f"{after.value:12.5g} {after.stderr:9.2g}" if after else "           -"))
     rows += ["", f"recordings and reports are in {folder} (open {folder}/diagnosis/report.html)"]
     return "\n".join(rows)
+
+
+def tracking_benches(bench, hidden, parameters, seed: int = 0, progress=None):
+    """A bench with `hidden` concealed, recorded, fitted and diagnosed, for tracking studies.
+
+    Returns the models before and after the diagnosis and the plant itself as `magjax.inverse.PlainActuator`, and the
+    diagnosis as a dict with its verdict and message.
+    """
+    from magjax.effects import CATALOGUE
+    from magjax.inverse import PlainActuator
+
+    bench = load_bench(bench)
+    effect = {e.name: e for e in CATALOGUE}[hidden](**parameters)
+    true = concealed_actuator(bench, effect)
+    rng = np.random.default_rng(seed)
+    sines = [*SINES, (100, 0.8, 0.0), (200, 0.4, -0.3), (30, 0.85, 0.0)]
+    recordings = [record(true, f, A, b, rng, f"sine {f} Hz, {A} A") for f, A, b in sines]
+    found = diagnose(recordings, bench, progress=progress)
+    repaired = (found.repaired or found.base).actuator
+    models = [PlainActuator.from_actuator(a) for a in (found.base.actuator, repaired, true)]
+    return (*models, {"verdict": found.verdict, "message": found.message})

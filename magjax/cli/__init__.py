@@ -15,6 +15,7 @@ COMMANDS = {
     "export": ("magjax.cli.data", "recordings into CSV, MAT or NetCDF"),
     "report": ("magjax.cli.fit", "build the HTML report of a result folder again"),
     "invert": ("magjax.cli.control", "a wanted displacement to the current to apply"),
+    "control": ("magjax.cli.control", "l1 design, margins, closed-loop simulation"),
 }
 
 

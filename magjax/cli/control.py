@@ -1,13 +1,32 @@
-"""Command invert."""
+"""Commands invert and control."""
 
 import json
+import sys
 
-from .runtime import parser
+from .runtime import Progress, output_folder, parser
+
+USAGE = """usage: magjax control {design,simulate,compare} [OPTIONS]
+
+  design    l1-optimal robust controller (T&B Sec. 4): certified gamma, hard rows, margins
+  simulate  one strategy on one trajectory: CSV with time_s, wanted_m, reached_m, current_A
+  compare   every strategy on the nominal plant, on one with fit errors, and on a bench with
+            concealed physics before and after its repair
+
+example: magjax control design --u-bar 3.25 --out design"""
 
 
 def run(command: str, arguments: list[str]) -> int:
     """Run one of the commands of this module."""
-    return run_invert(arguments)
+    if command == "invert":
+        return run_invert(arguments)
+    actions = {"design": run_design, "simulate": run_simulate, "compare": run_compare}
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0
+    if arguments[0] not in actions:
+        print(f'magjax control: no action "{arguments[0]}"; give one of {", ".join(actions)}', file=sys.stderr)
+        return 2
+    return actions[arguments[0]](arguments[1:])
 
 
 def run_invert(arguments) -> int:
@@ -18,9 +37,74 @@ def run_invert(arguments) -> int:
     p.add_argument("--bench", help="bench file (TOML) or a built-in name")
     p.add_argument("--model", help="a fitted result folder")
     p.add_argument("--out", default="current.csv", help="CSV to write: time_s, current_A")
+    p.add_argument("--of-reading", action="store_true", help="the trajectory is that of the sensor's reading: undo its lag and delay too")
     options = p.parse_args(arguments)
     from magjax.inverse.command import invert_file
 
-    summary = invert_file(options.trajectory, options.bench, options.model, options.out)
+    summary = invert_file(options.trajectory, options.bench, options.model, options.out, options.of_reading)
+    print(json.dumps(summary) if options.json else summary["message"])
+    return 0
+
+
+def _plant(options):
+    from magjax.inverse.command import load_actuator
+    from magjax.inverse.dynamic import PlainActuator
+
+    return PlainActuator.from_actuator(load_actuator(options.bench, options.model))
+
+
+def _common(name, text, example):
+    p = parser(f"control {name}", text, example)
+    p.add_argument("--bench", default=None, help="bench file (TOML) or a built-in name (default aa-050h)")
+    p.add_argument("--model", help="a fitted result folder")
+    p.add_argument("--T", type=float, default=5e-4, help="sample time, s (default 5e-4)")
+    p.add_argument("--u-bar", type=float, default=3.25, help="saturation in units of M_s^2 (default 3.25, T&B Fig. 16)")
+    return p
+
+
+def run_design(arguments) -> int:
+    """magjax control design."""
+    p = _common("design", "The l1-optimal controller of T&B Sec. 4.2 for the rod of a bench or a fitted model.", "magjax control design --u-bar 3.25 --out design")
+    p.add_argument("--r-bar", type=float, default=30.0, help="largest reference, um (default 30)")
+    p.add_argument("--w-bar", type=float, default=0.1, help="largest inversion error, M_s^2 (default 0.1)")
+    p.add_argument("--c-w", type=float, default=6.53e-13, help="size of the model's uncertainty, um per (A/m)^2 (default 6.53e-13)")
+    p.add_argument("--taps", type=int, default=40, help="taps of the Youla parameter (default 40)")
+    p.add_argument("--figures", action="store_true", help="also compute T&B Figs. 13-15 (needs --out)")
+    p.add_argument("--out", help="folder for design.json and the figures")
+    options = p.parse_args(arguments)
+    folder = output_folder(options.out)
+    from magjax.control.command import design_summary
+
+    summary = design_summary(_plant(options), options, folder)
+    print(json.dumps(summary) if options.json else summary["message"])
+    return 0
+
+
+def run_simulate(arguments) -> int:
+    """magjax control simulate."""
+    p = _common("simulate", "One tracking strategy on the actuator, integrated event by event.", "magjax control simulate --strategy l1 --out track.csv")
+    p.add_argument("--strategy", default="dynamic_inverse", help="proportional, static_inverse, dynamic_inverse, l1, l1_over_relaxed")
+    p.add_argument("--trajectory", default="sine", help="sine (20 Hz), aperiodic (round 30 Hz), or a CSV with time_s and displacement_m")
+    p.add_argument("--out", default="track.csv", help="CSV to write")
+    options = p.parse_args(arguments)
+    from magjax.control.command import simulate_summary
+
+    summary = simulate_summary(_plant(options), options)
+    print(json.dumps(summary) if options.json else summary["message"])
+    return 0
+
+
+def run_compare(arguments) -> int:
+    """magjax control compare."""
+    p = _common("compare", "Every strategy on the nominal plant, with fit errors, and with concealed physics before and after its repair.",
+                "magjax control compare --hide amplifier_lag --out study")  # fmt: skip
+    p.add_argument("--hide", default="amplifier_lag", choices=("amplifier_lag", "quartic_magnetostriction", "none"), help="what to conceal (default amplifier_lag)")
+    p.add_argument("--out", help="folder for study.json and the figure")
+    options = p.parse_args(arguments)
+    folder = output_folder(options.out)
+    from magjax.control.command import compare_summary
+
+    with Progress(options.quiet) as progress:
+        summary = compare_summary(_plant(options), options, folder, progress)
     print(json.dumps(summary) if options.json else summary["message"])
     return 0

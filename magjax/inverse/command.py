@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ConfigurationError, RecordingError
-from .dynamic import KNOWN_INVERSES, PlainActuator, current_for_displacement
+from .dynamic import KNOWN_INVERSES, SENSOR_INVERSES, PlainActuator, current_for_displacement
 
 
-def invert_file(trajectory, bench, model, out) -> dict:
+def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict:
     """Read time_s and displacement_m (or _um), write time_s and current_A; returns a summary."""
-    plant = PlainActuator.from_actuator(_actuator(bench, model))
-    time, wanted = _trajectory(Path(trajectory))
+    plant = PlainActuator.from_actuator(load_actuator(bench, model))
+    time, wanted = read_trajectory(Path(trajectory))
     h = float(np.median(np.diff(time)))
-    current, infeasible, saturated = current_for_displacement(plant, wanted, h)
+    current, infeasible, saturated = current_for_displacement(plant, wanted, h, of_reading)
     out = Path(out)
     partial = out.with_name(out.name + ".part")
     try:
@@ -21,7 +21,8 @@ def invert_file(trajectory, bench, model, out) -> dict:
         partial.replace(out)
     except OSError as error:
         raise ConfigurationError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-    left = [e for e in plant.effects if e not in KNOWN_INVERSES]
+    known = (*KNOWN_INVERSES, *(SENSOR_INVERSES if of_reading else ()))
+    left = [e for e in plant.effects if e not in known]
     text = f"current {current.min():.4g} .. {current.max():.4g} A; wrote {out}"
     if infeasible.any():
         text += f"; {int(infeasible.sum())} samples were not feasible (0 <= u <= M_s^2) and the nearest was taken, first at t = {time[np.argmax(infeasible)]:.4g} s"
@@ -32,7 +33,8 @@ def invert_file(trajectory, bench, model, out) -> dict:
     return {"file": str(out), "infeasible": int(infeasible.sum()), "saturated": int(saturated.sum()), "not_compensated": left, "message": text}
 
 
-def _actuator(bench, model):
+def load_actuator(bench, model):
+    """The actuator of a fitted result folder, else of a bench."""
     from ..cli.runtime import prepare_jax
 
     prepare_jax()
@@ -45,7 +47,8 @@ def _actuator(bench, model):
     return load_bench(bench or "aa-050h").actuator()
 
 
-def _trajectory(path):
+def read_trajectory(path):
+    """(time, displacement) of a CSV; raises `RecordingError` naming what is missing."""
     from ..readers import UNITS, _parse, _read_csv
 
     if not path.exists():

@@ -11,7 +11,8 @@ from ..errors import ConfigurationError
 from .operator import PlainPreisach
 
 MU0 = 4e-7 * np.pi
-KNOWN_INVERSES = ("amplifier_lag",)
+KNOWN_INVERSES = ("amplifier_lag", "excess_loss", "quartic_magnetostriction", "second_mode")
+SENSOR_INVERSES = ("sensor_lag", "transport_delay")  # undone where the reading is to follow; the motion does not need it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,26 +64,69 @@ def implicit_euler(plant: PlainActuator, current, h: float, operator=None):
     return np.array(fields), np.array(magnetizations)
 
 
+def second_mode_force(plant: PlainActuator, displacement, h: float):
+    """The free displacement that makes both modes together follow `displacement`, over the whole trajectory at once.
+
+    U = Y / (G + gain (G2 - 1)) on a padded FFT: the ends are held, so let the trajectory begin and end at rest.
+    """
+    mode = plant.effects["second_mode"]
+    y = np.asarray(displacement, float)
+    pad = max(len(y), int(2.0 / (plant.f0 * h)))
+    whole = np.concatenate([np.full(pad, y[0]), y, y[-1] + (y[0] - y[-1]) * 0.5 * (1 - np.cos(np.pi * np.arange(pad) / pad))])
+    s = 2j * np.pi * np.fft.rfftfreq(len(whole), h)
+    w, w2 = 2 * np.pi * plant.f0, 2 * np.pi * mode["f2"]
+    first = w**2 / (s * s + 2 * plant.xi * w * s + w**2)
+    second = w2**2 / (s * s + 2 * mode["xi2"] * w2 * s + w2**2) - 1
+    quiet = np.abs(s) < 2 * np.pi * 20 * max(plant.f0, mode["f2"])  # beyond, differentiating twice only lifts rounding
+    U = np.where(quiet, np.fft.rfft(whole) / (first + mode["gain"] * second), 0.0)
+    return np.fft.irfft(U, len(whole))[pad : pad + len(y)]
+
+
 def feasible_magnetization(plant: PlainActuator, displacement, h: float):
     """M_bar = sqrt(u_bar) of (5) for a wanted displacement, and which samples had to be made feasible.
 
     u_bar = M_s^2/(l_rod lambda_s) (y'' / w0^2 + 2 xi y'/w0 + y) must lie in [0, M_s^2]; the nearest value that does
-    is taken elsewhere.
+    is taken elsewhere. A second mode and a quartic law of the plant are inverted too.
     """
     y = np.asarray(displacement, float)
     w0 = 2 * np.pi * plant.f0
-    speed = np.gradient(y, h)
-    force = np.gradient(speed, h) / w0**2 + 2 * plant.xi / w0 * speed + y
+    if "second_mode" in plant.effects:
+        force = second_mode_force(plant, y, h)
+    else:
+        speed = np.gradient(y, h)
+        force = np.gradient(speed, h) / w0**2 + 2 * plant.xi / w0 * speed + y
     square = force / (plant.l_rod * plant.lambda_s)
-    return plant.M_s * np.sqrt(np.clip(square, 0.0, 1.0)), (square < 0) | (square > 1)
+    wrong = (square < 0) | (square > 1)
+    square = np.clip(square, 0.0, 1.0)
+    if "quartic_magnetostriction" in plant.effects:  # m^2 + b (m^4 - m^2) = square, without cancellation
+        b = plant.effects["quartic_magnetostriction"]["b"]
+        root = np.sqrt(np.maximum((1 - b) ** 2 + 4 * b * square, 0.0))
+        square = np.clip(2 * square / np.maximum(1 - b + root, 1e-300), 0.0, 1.0)
+    return plant.M_s * np.sqrt(square), wrong
 
 
-def current_for_displacement(plant: PlainActuator, displacement, h: float):
+def undo_sensor(plant: PlainActuator, reading, h: float):
+    """The displacement whose reading is wanted: lag and delay of the sensor taken out."""
+    y = np.asarray(reading, float)
+    lag = plant.effects.get("sensor_lag")
+    if lag is not None:
+        speed = np.gradient(y, h)
+        y = y + lag["tau"] * speed + lag["order2"] * lag["tau"] ** 2 * np.gradient(speed, h)
+    if "transport_delay" in plant.effects:
+        t = h * np.arange(len(y))
+        from scipy.interpolate import CubicSpline
+
+        y = CubicSpline(t, y)(np.clip(t + plant.effects["transport_delay"]["tau"], t[0], t[-1]))
+    return y
+
+
+def current_for_displacement(plant: PlainActuator, displacement, h: float, of_reading: bool = False):
     """The current to apply, A, by the inverse (7), with the secant of M: exact for the implicit Euler model.
 
-    Returns (current, infeasible samples, saturated samples). Of the effects, those in `KNOWN_INVERSES` are compensated.
+    `of_reading`: the trajectory is wanted of the sensor's reading, whose lag and delay are then undone. Returns
+    (current, infeasible samples, saturated samples). Of the effects, those in `KNOWN_INVERSES` are compensated.
     """
-    wanted, infeasible = feasible_magnetization(plant, displacement, h)
+    wanted, infeasible = feasible_magnetization(plant, undo_sensor(plant, displacement, h) if of_reading else displacement, h)
     operator = plant.operator.copy()
     fields, magnetizations, saturated = [], [], []
     for m in wanted:
@@ -92,6 +136,10 @@ def current_for_displacement(plant: PlainActuator, displacement, h: float):
     H, M = np.array(fields), np.array(magnetizations)
     rate = np.concatenate([[0.0], np.diff(H + M)]) / h
     current = rate / plant.c1 + (H - plant.H_bias) / plant.c0
+    if "excess_loss" in plant.effects:
+        e = plant.effects["excess_loss"]
+        flux_rate = MU0 * rate
+        current = current + e["k"] * flux_rate / (flux_rate**2 + e["rate_knee"] ** 2 + 1e-12) ** 0.25 / plant.c0
     if "amplifier_lag" in plant.effects:
         current = current + plant.effects["amplifier_lag"]["tau"] * np.concatenate([[0.0], np.diff(current)]) / h
     return current, infeasible, np.array(saturated)

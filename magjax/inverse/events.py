@@ -9,16 +9,23 @@ every event is in closed form, and the last x takes a monotone Newton iteration 
 
 import math
 
+from ..errors import ConfigurationError
 from .dynamic import PlainActuator
+
+PLANT_EFFECTS = ("amplifier_lag", "quartic_magnetostriction")
 
 
 class HeldCurrent:
     """An actuator driven by a current that is held between calls. State: `field`, the memory, `displacement`, `speed`.
 
-    `events`: how many the last call crossed.
+    `events`: how many the last call crossed. Of the effects an amplifier's lag and a quartic law are simulated (the lag
+    piecewise: its mean over each of the `pieces`); raises `ConfigurationError` for others.
     """
 
     def __init__(self, plant: PlainActuator, current: float = 0.0, pieces: int = 8):
+        unknown = [e for e in plant.effects if e not in PLANT_EFFECTS]
+        if unknown:
+            raise ConfigurationError(f"{', '.join(unknown)}: not simulated event by event; take magjax.simulate for this plant")
         self.plant, self.pieces, self._start = plant, pieces, float(current)
         self.reset()
 
@@ -27,6 +34,7 @@ class HeldCurrent:
         self.operator = self.plant.operator.copy()
         self.field = self.plant.c0 * self._start + self.plant.H_bias
         self.operator.apply(self.field)
+        self.current = self._start
         self.displacement, self.speed, self.events = self._free(), 0.0, 0
 
     @property
@@ -36,7 +44,9 @@ class HeldCurrent:
 
     def _free(self):
         p = self.plant
-        return p.l_rod * p.lambda_s * (self.magnetization / p.M_s) ** 2
+        square = (self.magnetization / p.M_s) ** 2
+        b = p.effects.get("quartic_magnetostriction", {}).get("b", 0.0)
+        return p.l_rod * p.lambda_s * (square + b * (square * square - square))
 
     def hold(self, current: float, duration: float) -> float:
         """Hold `current` (A) for `duration` (s): field, memory and rod move on; returns the displacement, m.
@@ -47,11 +57,22 @@ class HeldCurrent:
         piece = duration / self.pieces
         before = self._free()
         for _ in range(self.pieces):
-            self.advance(current, piece)
+            self.advance(self._delivered(current, piece), piece)
             after = self._free()
             self._rod(before, after, piece)
             before = after
         return self.displacement
+
+    def _delivered(self, command, piece):
+        """Mean current over a piece behind the amplifier's lag."""
+        tau = self.plant.effects.get("amplifier_lag", {}).get("tau", 0.0)
+        if tau <= 0:
+            self.current = command
+            return command
+        share = -math.expm1(-piece / tau)
+        mean = command + (self.current - command) * share * tau / piece
+        self.current += (command - self.current) * share
+        return mean
 
     def advance(self, current: float, duration: float) -> float:
         """Field and memory alone under a held current; returns the field, A/m."""

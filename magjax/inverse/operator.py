@@ -194,6 +194,12 @@ class PlainPreisach:
         _, c1, c2 = self._quadratic(cell, base, rising)
         self.unique = bool(c1 != 0.0 or c2 != 0.0)
 
-    def invert(self, targets) -> np.ndarray:
-        """Fields for a sequence of wanted M, A/m, carrying the memory along."""
+    def invert(self, targets, accelerate: bool = False) -> np.ndarray:
+        """Fields for a sequence of wanted M, A/m, carrying the memory along; `accelerate`: compiled by numba."""
+        if accelerate:
+            from .accelerated import invert_many
+
+            fields, _, saturated, _ = invert_many(self, targets)
+            self.saturated = bool(saturated[-1]) if len(saturated) else False
+            return fields
         return np.array([self.solve(float(m)) for m in np.asarray(targets, float)])

@@ -1,0 +1,140 @@
+"""The l1 design against known answers, python-control and its own certificates."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from magjax.control import TrackingProblem, design, optimal_sensitivity
+from magjax.control.l1 import knee
+from magjax.control.problem import C_W_UM, rod, weight
+from magjax.control.realize import Controller, reduced_controller
+from magjax.errors import ConfigurationError
+
+
+def test_the_papers_closed_forms():
+    u_star, flat = knee(TrackingProblem())
+    assert u_star == pytest.approx(4.097862933, rel=1e-7)
+    assert flat == pytest.approx(11.190137818, rel=1e-7)
+    beyond = design(TrackingProblem(u_bar=7.5))
+    assert beyond.gamma == pytest.approx(flat, rel=1e-7) and beyond.control == pytest.approx(u_star, rel=1e-6)
+
+
+@pytest.mark.parametrize("u_bar", [0.5, 1.25, 3.25, 4.5])
+def test_certified_gap_and_hard_rows(u_bar):
+    made = design(TrackingProblem(u_bar=u_bar), taps=40)
+    assert 0 <= made.gap <= 1e-6
+    assert made.control <= u_bar and made.norms["robust"] <= 1
+
+
+def test_gamma_is_monotone_and_falls_by_the_stated_share():
+    gammas = [design(TrackingProblem(u_bar=u)).gamma for u in (1.0, 2.0, 3.25, 4.0, 5.0)]
+    assert np.all(np.diff(gammas) < 1e-6)
+    assert gammas[2] / gammas[-1] - 1 == pytest.approx(0.425, abs=0.002)  # at T = 0.5 ms with the printed constants
+    uncertain = [design(TrackingProblem(weight=weight(c * C_W_UM), u_bar=7.5)).gamma for c in (1, 20, 60)]
+    noisy = [design(TrackingProblem(w_bar=w)).gamma for w in (0.05, 0.1, 0.2)]
+    assert np.all(np.diff(uncertain) > 0) and np.all(np.diff(noisy) > 0)
+
+
+@pytest.mark.parametrize(
+    ("zeros", "poles", "value"),
+    [((0,), ("1/2",), Fraction(3)), ((0, "1/2"), ("2/3",), Fraction(149, 14)), (("1/2",), ("4/5",), Fraction(168, 43)), ((0, "1/2"), ("1/5",), Fraction(26))],
+)
+def test_pure_sensitivity_is_exact_in_rationals(zeros, poles, value):
+    found = optimal_sensitivity(zeros, poles)
+    assert found.exact and found.value == value
+    points = [Fraction(z) for z in zeros]
+    assert all(sum(s * p**k if k else s for k, s in found.S.items()) == 1 for p in points)
+    assert all(sum(s * Fraction(p) ** k for k, s in found.S.items()) == 0 for p in poles)
+
+
+def test_wrong_interpolation_points_are_refused():
+    for zeros, poles, words in (((2,), (), "unit disc"), ((0, 0), (), "repeated"), (("1/2",), ("1/2",), "repeated")):
+        with pytest.raises(ConfigurationError, match=words):
+            optimal_sensitivity(zeros, poles)
+
+
+@pytest.mark.parametrize("u_bar", [3.25, 5.0])
+def test_reduced_controller_keeps_the_rows_and_python_control_agrees(u_bar):
+    from magjax.control.models import rebuilt_norms
+
+    made = design(TrackingProblem(u_bar=u_bar))
+    small = reduced_controller(made)
+    assert small.order <= 3 and not small.breaks() and small.gamma == pytest.approx(made.gamma, rel=1e-3)
+    for controller in (small, Controller(made)):
+        rebuilt = rebuilt_norms(controller)
+        for name, value in controller.norms.items():
+            assert rebuilt[name] == pytest.approx(value, abs=1e-6 * max(1.0, controller.gamma)), name
+
+
+def test_margins_say_what_a_delay_does():
+    controller = reduced_controller(design(TrackingProblem(u_bar=3.25)))
+    margins = controller.margins()
+    assert margins.delay == 0 and margins.gain > 2 and margins.phase > 60
+    slow = reduced_controller(design(TrackingProblem(u_bar=0.5))).margins()
+    assert slow.delay >= 1 and slow.modulus > margins.modulus
+
+
+def test_closed_loop_by_steps_equals_the_norms():
+    """The worst reference of the error row, played through `step`, reaches the l1 norm."""
+    made = design(TrackingProblem(u_bar=3.25))
+    controller = Controller(made)
+    n, d, _ = made.problem.factors()
+    from magjax.control.problem import response
+
+    count = 300
+    g = response(n, d, count)
+    lG = np.concatenate([[0.0, 0.0], g])[:count]
+    loop = np.convolve(lG, np.append(made.Q, np.zeros(count)))[:count]
+    row = -made.problem.r_bar * loop
+    row[2] += made.problem.r_bar
+    reference = made.problem.r_bar * np.sign(row[::-1])
+    x, errors = np.zeros(len(controller.model[0])), []
+    A, B, C, _ = controller.model
+    for k in range(count):
+        y = float(C[0] @ x)
+        u = controller.step(reference[k] - y)
+        x = A @ x + B[:, 0] * u
+        errors.append((reference[k - 2] if k >= 2 else 0.0) - y)
+    assert errors[-1] == pytest.approx(made.norms["error_r"], rel=1e-9)
+
+
+def test_anti_windup_recovers_sooner():
+    made = design(TrackingProblem(u_bar=5.0))
+    after = []
+    for guarded in (True, False):
+        controller = Controller(made)
+        A, B, C, _ = controller.model
+        x, y = np.zeros(len(A)), []
+        for k in range(200):
+            reach = 60.0 if k < 60 else 10.0
+            out = float(C[0] @ x)
+            u = controller.step(reach - out, 0.5, anti_windup=guarded)
+            x = A @ x + B[:, 0] * u
+            y.append(out)
+        after.append(np.abs(np.array(y[70:]) - 10.0).max())
+    assert after[0] < 0.3 * after[1]
+
+
+def test_unstable_plants():
+    from magjax.control.models import rebuilt_norms
+
+    plant = (np.array([1.0]), np.array([1.0, -1.5]))
+    problem = TrackingProblem(plant=plant, r_bar=1.0, w_bar=0.1, u_bar=6.0, robust=False)
+    made = design(problem)
+    rebuilt = rebuilt_norms(Controller(made))
+    assert rebuilt["error_r"] == pytest.approx(made.norms["error_r"], rel=1e-6) and made.control <= 6.0
+    with pytest.raises(ConfigurationError, match=r"smallest feasible u_bar is 3\.63"):
+        design(TrackingProblem(plant=plant, r_bar=1.0, w_bar=0.1, u_bar=0.5, robust=False))
+    with pytest.raises(ConfigurationError, match="cancelled"):
+        design(TrackingProblem(plant=(np.array([1.0, -1.5]), np.convolve([1.0, -1.5], [1.0, -0.5]))))
+    with pytest.raises(ConfigurationError, match="unit circle"):
+        design(TrackingProblem(plant=(np.array([1.0]), np.array([1.0, -1.0]))))
+
+
+def test_bad_problems_are_told():
+    for changed, words in (({"u_bar": -1.0}, "u_bar"), ({"weight": (np.array([1.0]), np.array([1.0, -2.0]))}, "W_0 is unstable")):
+        with pytest.raises(ConfigurationError, match=words):
+            TrackingProblem(**changed)
+    with pytest.raises(ConfigurationError, match="positive"):
+        rod(f0=-1)

@@ -1,0 +1,160 @@
+"""Event-by-event integration, the compiled inversion, the bounds of Propositions 4.1-4.3, compensation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from magjax.effects import ExcessLoss, QuarticMagnetostriction, SecondMode, SensorLag
+from magjax.errors import ConfigurationError
+from magjax.inverse import PlainActuator, PlainPreisach, current_for_displacement, implicit_euler
+from magjax.inverse.bounds import backward_bound, forward_bound, simulated_worst, static_bound
+from magjax.inverse.events import HeldCurrent
+from magjax.simulate import simulate
+from tests.test_simulate import actuator
+
+
+def plant_with(seed=0, L=25):
+    rng = np.random.default_rng(seed)
+    masses = np.tril(rng.random((L, L)) * (rng.random((L, L)) > 0.5))
+    masses *= 7e5 / masses.sum()
+    return PlainActuator(PlainPreisach(masses, -3100.0, 27700.0), 70.0, 1.54e4, 1.23e4, 1300, 2.83e-5, 1.313e-3, 7.87e5, 5.13e-2, 392.0, 0.7783)
+
+
+def test_semigroup():
+    whole, parts = HeldCurrent(plant_with()), HeldCurrent(plant_with())
+    rng = np.random.default_rng(1)
+    for _ in range(1500):
+        I, h, s = rng.uniform(-1.3, 1.3), 10 ** rng.uniform(-7, -3), rng.uniform()
+        whole.advance(I, h)
+        parts.advance(I, h * s)
+        parts.advance(I, h * (1 - s))
+        assert abs(whole.field - parts.field) < 1e-13 * 3e4 * 10
+        assert abs(whole.magnetization - parts.magnetization) < 1e-13 * 7.87e5
+
+
+def test_events_satisfy_the_equation_and_implicit_euler_approaches_them():
+    """(4) in integral form over each hold: change of H + M = c1 times the integral of I - (H - H_bias)/c0."""
+    plant = plant_with()
+    exact = HeldCurrent(plant)
+    n, h = 200, 5e-5
+    current = 0.6 * np.sin(2 * np.pi * np.arange(n) / n)
+    for I in current[:60]:
+        before = exact.field + exact.magnetization
+        trial = []
+        for _ in range(200):
+            trial.append(exact.field)
+            exact.advance(float(I), h / 200)
+        trial.append(exact.field)
+        integral = plant.c1 * h * (I - (np.trapezoid(trial) / 200 - plant.H_bias) / plant.c0)
+        assert exact.field + exact.magnetization - before == pytest.approx(integral, abs=2e-3 + 2e-4 * abs(integral))
+    errors = []
+    for m in (1, 4):
+        fine = np.repeat(current, m)
+        M = implicit_euler(plant, fine, h / m)[1][::m]
+        held, reached = HeldCurrent(plant), []
+        for I in current:
+            held.advance(float(I), h)
+            reached.append(held.magnetization)
+        errors.append(np.abs(np.array(reached)[:-1] - M[1:]).max())
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_engine_agrees_with_the_events_to_its_order():
+    act = actuator(25)
+    plant = PlainActuator.from_actuator(act)
+    errors = []
+    for n in (200, 400):
+        h = 0.02 / n
+        t = h * np.arange(n)
+        wave = 0.3 * (1 - np.cos(2 * np.pi * 50 * t))
+        held, M = HeldCurrent(plant), []
+        for k in range(n):
+            M.append(held.magnetization)
+            held.advance(0.5 * float(wave[k] + wave[min(k + 1, n - 1)]), h)  # held at mid-sample: second order
+        errors.append(np.abs(np.asarray(simulate(act, wave, h).magnetization) - M)[: n - 1].max())
+    assert errors[1] < 0.35 * errors[0] and errors[0] < 2e-3 * plant.M_s
+
+
+def test_compiled_inversion_is_the_same_walk_and_does_not_drift():
+    pytest.importorskip("numba")
+    from magjax.inverse.accelerated import invert_many
+
+    rng = np.random.default_rng(0)
+    a, b = plant_with().operator, plant_with().operator
+    targets = rng.uniform(-7.2e5, 7.2e5, 5000)
+    assert np.array_equal(a.invert(targets), b.invert(targets, accelerate=True)) and a.extrema == b.extrema
+    many = np.clip(rng.uniform(-7.1e5, 7.1e5, 1_000_000), -7e5, 7e5)
+    grid = plant_with().operator
+    many[:1000] = rng.choice([grid.copy().apply(v) for v in grid.levels], 1000)
+    fields, values, _, excess = invert_many(grid, many)
+    assert excess <= 0  # iterations never above n_c + L
+    assert np.abs(values - many).max() < 1e-13 * 7.87e5
+    check = plant_with().operator
+    tail = np.array([check.apply(v) for v in fields])[-20000:]
+    assert np.abs(tail - many[-20000:]).max() < 1e-13 * 7.87e5
+
+
+def test_bounds_hold_and_guard_their_conditions():
+    plant = plant_with(L=8)
+    h = 1e-3
+    back = backward_bound(plant, h)
+    assert simulated_worst(plant, h, back.g_bar, trials=6, length=80) <= back.value
+    assert backward_bound(plant, h, 0.3 * back.g_bar).value >= back.value
+    forward = forward_bound(plant, 1.2e-5)
+    assert simulated_worst(plant, 1.2e-5, forward.g_bar, True, trials=4, length=60) <= forward.value
+    assert "says nothing" in forward.note
+    with pytest.raises(ConfigurationError, match="largest h that holds is 2.034e-05"):
+        forward_bound(plant, 5e-5)
+    one, two = static_bound(plant, delta_I=0.01), static_bound(plant, delta_I=0.02)
+    assert two.value - one.value == pytest.approx(0.01 * plant.operator.total)
+    L = plant.operator.cells
+    assert static_bound(plant, mass_errors=np.zeros((L, L))).value == pytest.approx(static_bound(plant, delta_I=0.0).value)
+    for wrong in ({}, {"delta_I": 0.1, "mass_errors": np.zeros((L, L))}, {"mass_errors": np.zeros((2, 2))}, {"delta_I": -1.0}):
+        with pytest.raises(ConfigurationError):
+            static_bound(plant, **wrong)
+
+
+def test_static_bound_covers_a_wrong_density():
+    true, L = plant_with(3), 25
+    rng = np.random.default_rng(5)
+    table = np.tril(np.ones((L, L)))
+    from magjax.inverse.bounds import _masses
+
+    masses = _masses(true)
+    worst = 0.0
+    for _ in range(5):
+        wrong = PlainPreisach(masses * (1 + 0.05 * rng.uniform(-1, 1, (L, L)) * table), -3100.0, 27700.0)
+        exact = true.operator.copy()
+        targets = 0.9 * min(wrong.total, exact.total) * rng.uniform(-1, 1, 200)
+        worst = max(worst, max(abs(exact.apply(wrong.solve(float(m))) - m) for m in targets))
+    assert 0 < worst <= static_bound(true, delta_I=0.05).value
+
+
+CASES = [
+    (ExcessLoss(k=60.0), False),
+    (QuarticMagnetostriction(b=0.3), False),
+    (SecondMode(gain=0.4, f2=600.0, xi2=0.1), False),
+    (SensorLag(tau=3e-4, order2=0.5), True),
+]
+
+
+@pytest.mark.parametrize(("effect", "of_reading"), CASES, ids=[e.name for e, _ in CASES])
+def test_compensation_of_a_repaired_actuator(effect, of_reading):
+    act = actuator(25)
+    repaired = act.with_effect(effect)
+    plain, known = PlainActuator.from_actuator(act), PlainActuator.from_actuator(repaired)
+    n, h = 2400, 2.5e-5
+    t = h * np.arange(n)
+    wanted = 28e-6 + 10e-6 * np.sin(2 * np.pi * 50 * t) * np.minimum(1, t / 0.02)
+    errors = []
+    for model in (plain, known):
+        current = current_for_displacement(model, wanted, h, of_reading)[0]
+        signals = simulate(repaired, current, h)
+        reached = np.asarray(signals.reading if of_reading else signals.displacement)
+        errors.append(np.sqrt(np.mean((reached - wanted)[n // 3 : -50] ** 2)))
+    assert errors[1] < 0.35 * errors[0]
+
+
+def test_names_of_the_plain_actuator():
+    assert {f.name for f in dataclasses.fields(PlainActuator)} >= {"R_eddy", "c0", "effects"}
