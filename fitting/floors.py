@@ -61,7 +61,9 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
         z, amplitude = top / np.sqrt(bottom), top / bottom
         if name not in found or abs(z) > abs(found[name].z):
             found[name] = RecordEffect(name, float(z), float(amplitude), float(1 / np.sqrt(bottom)), shapes, tuple(columns))
+    longest = max(s.samples * s.dt for s in spectra)
     for f in (50.0, 60.0):
+        enough = min(2 / f, longest * 0.999)  # a shorter record cannot tell a tone from slow noise: it takes no part in the score
         gain, power, number = 0.0, 0.0, 0
         fits = []
         for s in spectra:
@@ -74,8 +76,9 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
                 fits.append(np.zeros(s.samples))
                 continue
             best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(2), g)
-            gain += float(best @ g)
-            number += 2
+            if s.samples * s.dt >= enough:
+                gain += float(best @ g)
+                number += 2
             power = max(power, float(np.hypot(*best)))
             fits.append(best[0] * parts[0] + best[1] * parts[1])
         z = (gain - number) / np.sqrt(2 * max(number, 1))

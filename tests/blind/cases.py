@@ -103,7 +103,8 @@ def write_case(case: Case, folder: Path):
     for k, d in enumerate(rows + check):
         count = y.shape[1]
         time = np.arange(count) * (4 / d["frequency"] / count)
-        slow = np.cumsum(rng.normal(size=count)) * 2e-10  # some red noise of the sensor
+        step = time[1]
+        slow = np.cumsum(rng.normal(size=count)) * np.sqrt(step) * 3e-8  # some red noise of the sensor, m per root of s
         reading = y[k] + case.noise * rng.normal(size=count) + slow - slow.mean()
         counts = 2e-4 / 2**16
         reading = np.round(reading / counts) * counts
