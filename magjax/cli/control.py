@@ -102,9 +102,15 @@ def run_compare(arguments) -> int:
     p.add_argument("--out", help="folder for study.json and the figure")
     options = p.parse_args(arguments)
     folder = output_folder(options.out)
-    from magjax.control.command import compare_summary
+    from magjax.control.command import HIDDEN, compare_summary
 
     with Progress(options.quiet) as progress:
-        summary = compare_summary(_plant(options), options, folder, progress)
+
+        def benches():  # the data side of the study: only the command line stands above both
+            from fitting.demo import tracking_benches
+
+            return tracking_benches(options.bench or "aa-050h", options.hide, HIDDEN[options.hide], options.seed, progress)
+
+        summary = compare_summary(_plant(options), options, folder, None if options.hide == "none" else benches)
     print(json.dumps(summary) if options.json else summary["message"])
     return 0

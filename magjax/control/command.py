@@ -102,14 +102,12 @@ def simulate_summary(plant, options) -> dict:
 HIDDEN = {"amplifier_lag": {"tau": 4e-4}, "quartic_magnetostriction": {"b": 0.25}}
 
 
-def compare_summary(plant, options, folder, progress=None) -> dict:
-    """The tracking table; with something concealed the bench is recorded, fitted and diagnosed first."""
+def compare_summary(plant, options, folder, benches=None) -> dict:
+    """The tracking table. `benches()`: models before and after a diagnosis, the plant itself, and what was found."""
     plants = {"nominal": (plant, plant), "fit errors": (plant, perturbed(plant, seed=options.seed))}
     found = {}
-    if options.hide != "none":
-        from fitting.demo import tracking_benches
-
-        before, after, true, found = tracking_benches(options.bench or "aa-050h", options.hide, HIDDEN[options.hide], options.seed, progress)
+    if benches is not None:
+        before, after, true, found = benches()
         plants["concealed, before diagnosis"] = (true, before)
         plants["concealed, after repair"] = (true, after)
     rows = compare(plants, options.T)

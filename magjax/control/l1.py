@@ -43,7 +43,7 @@ class Design:
         return self.norms["control_r"] + self.norms["control_w"]
 
 
-class _Channels:
+class Channels:
     """The five closed-loop impulse responses, each constant + matrix @ x, over `rows` samples."""
 
     def __init__(self, problem: TrackingProblem, taps: int, rows: int):
@@ -112,7 +112,7 @@ class _Channels:
         return {k: float(np.abs(c + A @ x).sum()) for k, (c, A) in self.pieces.items()}
 
 
-def _programme(channels: _Channels, u_bar: float, slack: float, minimum_control: bool = False, bound=None):
+def programme(channels: Channels, u_bar: float, slack: float, minimum_control: bool = False, bound=None):
     """min gamma (or the control's norm) over x, with one absolute value per coefficient."""
     parts = {k: v for k, v in channels.pieces.items() if np.isfinite(u_bar) or minimum_control or not k.startswith("control")}
     n, rows = channels.columns, channels.rows
@@ -142,19 +142,26 @@ def _programme(channels: _Channels, u_bar: float, slack: float, minimum_control:
     lower = np.concatenate([np.full(n, -np.inf if bound is None else -bound), np.zeros(m + 1)])
     upper = np.concatenate([np.full(n, np.inf if bound is None else bound), np.full(m + 1, np.inf)])
     A_ub, b_ub = sp.vstack(rows_abs).tocsr(), np.concatenate(rhs)
-    found = linprog(cost, A_ub, b_ub, A_eq, b_eq, np.stack([lower, upper], axis=1), method="highs")
+    limits = np.stack([lower, upper], axis=1)
+    for method in ("highs", "highs-ipm", "highs-ds"):  # degenerate optima (Q = 0) stop one now and then
+        found = linprog(cost, A_ub, b_ub, A_eq, b_eq, limits, method=method)
+        if found.status in (0, 2):
+            break
     return found, (cost, A_ub, b_ub, A_eq, b_eq, lower, upper)
 
 
-def _dual_bound(found, parts, most: float) -> float:
-    """A bound below the optimum from HiGHS's multipliers, valid whatever their rounding: variables lie within `most`."""
+def dual_bound(found, parts, most: float, loose=0.0) -> float:
+    """A bound below the optimum from HiGHS's multipliers, valid whatever their rounding: variables lie within `most`.
+
+    `loose`: by how much each equality may be missed.
+    """
     cost, A_ub, b_ub, A_eq, b_eq, lower, upper = parts
     y = np.minimum(found.ineqlin.marginals, 0.0)
     reduced = cost - A_ub.T @ y
     value = float(b_ub @ y)
     if A_eq is not None:
         reduced = reduced - A_eq.T @ found.eqlin.marginals
-        value += float(b_eq @ found.eqlin.marginals)
+        value += float(b_eq @ found.eqlin.marginals) - float(np.sum(np.abs(found.eqlin.marginals) * loose))
     lower, upper = np.maximum(lower, -most), np.minimum(upper, most)
     return value + float(np.sum(np.where(reduced > 0, reduced * lower, reduced * upper)))
 
@@ -174,11 +181,15 @@ def design(problem: TrackingProblem = None, taps: int = 40) -> Design:
     Returns a `Design` whose norms are re-evaluated from Q, whose `gamma` is an upper and whose `lower` is a certified
     lower bound. Raises `ConfigurationError` where no controller keeps the rows, with the smallest u_bar that can be kept.
     """
+    import scipy.signal  # noqa: F401  (its first import is no part of the time told)
+
+    from .lower import lower_bound
+
     problem = TrackingProblem() if problem is None else problem
     begin = time.perf_counter()
-    full = _Channels(problem, taps, taps + _tail(problem))
+    full = Channels(problem, taps, taps + _tail(problem))
     for slack in (BACK_OFF, 4 * BACK_OFF, 16 * BACK_OFF):
-        found, _ = _programme(full, problem.u_bar, slack)
+        found, _ = programme(full, problem.u_bar, slack)
         if found.status == 2:
             _refuse(full, problem)
         if found.status != 0:
@@ -188,7 +199,7 @@ def design(problem: TrackingProblem = None, taps: int = 40) -> Design:
         if norms["control_r"] + norms["control_w"] <= problem.u_bar and norms.get("robust", 0.0) <= 1:
             break
     gamma = norms["error_r"] + norms["error_w"]
-    lower = _lower(problem, taps, gamma, x) if not full.unstable else np.nan
+    lower = lower_bound(problem, taps, gamma) if not full.unstable else np.nan
     if not full.unstable:
         return Design(problem, x, gamma, lower, norms, time.perf_counter() - begin)
     # K = d_s X / V without the unstable poles that Q/(1 - lambda G_a Q) would cancel
@@ -196,21 +207,8 @@ def design(problem: TrackingProblem = None, taps: int = 40) -> Design:
     return Design(problem, (full.q @ x)[: taps + 8], gamma, lower, norms, time.perf_counter() - begin, pair)
 
 
-def _lower(problem, taps, gamma, x):
-    """Rows cut to the first samples hold for the beginning of any Q: with its dual a certified lower bound."""
-    short = _Channels(problem, taps, taps)
-    bounded = np.isfinite(problem.u_bar)
-    # ||Q||_1 is bounded by the saturation row; without it by what tracking at gamma would need at most
-    most = problem.u_bar / problem.r_bar if bounded else 1e3 * max(np.abs(x).sum(), 1.0)
-    found, parts = _programme(short, problem.u_bar, 0.0, bound=most)
-    if found.status != 0:
-        return 0.0
-    scale = max(most, problem.u_bar if bounded else 0.0, 2 * gamma, 1.0)
-    return max(_dual_bound(found, parts, scale), 0.0)
-
-
 def _refuse(channels, problem):
-    least, _ = _programme(channels, np.inf, 0.0, minimum_control=True)
+    least, _ = programme(channels, np.inf, 0.0, minimum_control=True)
     if least.status == 0:
         raise ConfigurationError(
             f"u_bar = {problem.u_bar:.6g} M_s^2 cannot be kept by any stabilizing controller; the smallest feasible u_bar is {least.fun * (1 + 1e-6):.6g}"

@@ -1,6 +1,8 @@
 """The l1 design against known answers, python-control and its own certificates."""
 
+import ast
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,6 +132,28 @@ def test_unstable_plants():
         design(TrackingProblem(plant=(np.array([1.0, -1.5]), np.convolve([1.0, -1.5], [1.0, -0.5]))))
     with pytest.raises(ConfigurationError, match="unit circle"):
         design(TrackingProblem(plant=(np.array([1.0]), np.array([1.0, -1.0]))))
+
+
+@pytest.mark.parametrize("numerator", [[1.0, -2.0], [1.0, -2.0, 2.5], [0.0, 1.0, -2.0], [1.0, -1.666666, -5.555555]])
+@pytest.mark.parametrize("u_bar", [30.0, np.inf])
+def test_plants_with_zeros_inside_the_disc_are_certified_by_interpolation(numerator, u_bar):
+    plant = (np.array(numerator), np.array([1.0, -0.5]))
+    made = design(TrackingProblem(plant=plant, r_bar=1.0, w_bar=0.05, u_bar=u_bar, robust=False), taps=50)
+    assert 0 <= made.gap < 2e-6 and made.control <= u_bar
+
+
+def test_lower_bound_stays_below_what_longer_controllers_reach():
+    for robust in (True, False):
+        short = design(TrackingProblem(weight=weight(30 * C_W_UM), robust=robust), taps=12)
+        assert short.lower <= design(TrackingProblem(weight=weight(30 * C_W_UM), robust=robust), taps=80).gamma <= short.gamma * (1 + 1e-7)
+
+
+def test_no_jax_behind_inversion_and_control():
+    root = Path(__file__).resolve().parents[2] / "magjax"
+    for path in [*root.glob("control/*.py"), *root.glob("inverse/*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not {n.split(".")[0] for n in names} & {"jax", "equinox", "optimistix", "fitting"}, path.name
 
 
 def test_bad_problems_are_told():
