@@ -51,13 +51,13 @@ def read_file(path: Path, bench) -> list[Recording]:
     suffix = path.suffix.lower()
     reader = {".nc": _read_netcdf, ".mat": _read_mat, ".mjlog": _read_log}.get(suffix, _read_csv)
     try:
-        table, metadata = reader(path)
+        tables = reader(path) if suffix == ".mjlog" else [reader(path)]
     except MagjaxError:
         raise
     except (OSError, ValueError, KeyError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read as {suffix[1:] or 'CSV'} ({error})") from None
-    origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "metadata": metadata}
-    return _recordings(path, table, origin, bench)
+    origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    return [r for table, metadata in tables for r in _recordings(path, table, {**origin, "metadata": metadata}, bench)]
 
 
 def _read_csv(path):
@@ -123,13 +123,10 @@ def _read_mat(path):
 
 
 def _read_log(path):
-    try:
-        from .acquire.log import read_log
-    except ImportError:
-        raise RecordingError(f"{path}: raw acquisition logs need magjax.acquire, which this installation lacks; export the log to .nc first") from None
+    """Every segment of a raw acquisition log: (table, metadata)."""
+    from .acquire.log import read_log
 
-    time, channels, header, _ = read_log(path)
-    return {"time_s": time, **channels}, dict(header)
+    return read_log(path)
 
 
 def _parse(name):
