@@ -5,9 +5,10 @@ import sys
 
 from .runtime import Progress, output_folder, parser
 
-USAGE = """usage: magjax control {design,simulate,compare} [OPTIONS]
+USAGE = """usage: magjax control {design,bounds,simulate,compare} [OPTIONS]
 
   design    l1-optimal robust controller (T&B Sec. 4): certified gamma, hard rows, margins
+  bounds    the inversion's error by T&B Props. 4.1-4.3 beside a simulated worst case
   simulate  one strategy on one trajectory: CSV with time_s, wanted_m, reached_m, current_A
   compare   every strategy on the nominal plant, on one with fit errors, and on a bench with
             concealed physics before and after its repair
@@ -19,7 +20,7 @@ def run(command: str, arguments: list[str]) -> int:
     """Run one of the commands of this module."""
     if command == "invert":
         return run_invert(arguments)
-    actions = {"design": run_design, "simulate": run_simulate, "compare": run_compare}
+    actions = {"design": run_design, "bounds": run_bounds, "simulate": run_simulate, "compare": run_compare}
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0
@@ -76,6 +77,18 @@ def run_design(arguments) -> int:
     from magjax.control.command import design_summary
 
     summary = design_summary(_plant(options), options, folder)
+    print(json.dumps(summary) if options.json else summary["message"])
+    return 0
+
+
+def run_bounds(arguments) -> int:
+    """magjax control bounds."""
+    p = _common("bounds", "Bounds of the inversion's error, T&B Props. 4.1-4.3, and a simulated worst case.", "magjax control bounds --delta-I 0.05 --T 5e-4")
+    p.add_argument("--delta-I", type=float, default=0.05, help="relative error of the Preisach masses (default 0.05)")
+    options = p.parse_args(arguments)
+    from magjax.control.command import bounds_summary
+
+    summary = bounds_summary(_plant(options), options)
     print(json.dumps(summary) if options.json else summary["message"])
     return 0
 

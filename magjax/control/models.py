@@ -5,7 +5,8 @@ Signals carry their units in their names: current_A, displacement_m, u_A2_per_m2
 
 import numpy as np
 
-from ..inverse.dynamic import PlainActuator
+from ..errors import ConfigurationError
+from ..inverse.dynamic import PlainActuator, magnetization_for
 from ..inverse.events import HeldCurrent
 
 
@@ -22,23 +23,23 @@ def linear_part(plant: PlainActuator):
     )  # fmt: skip
 
 
-def actuator_system(plant: PlainActuator, T: float):
-    """The whole actuator as a discrete `nlsys`: current held over T in, displacement out.
+def actuator_system(plant: PlainActuator, T: float, current: float = 0.0):
+    """The whole actuator as a discrete `nlsys`: current held over T in, displacement out, at rest at `current` (A) first.
 
     The memory of the hysteresis is a staircase of any length and no vector: it is kept beside the two states of the rod
     and moves when the system is updated, so simulate forward in time (`input_output_response`) and call `reset` first.
     """
     import control
 
-    actuator = HeldCurrent(plant)
+    actuator = HeldCurrent(plant, current)
 
     def update(t, x, u, params):
-        actuator.displacement, actuator.speed = float(x[0]), float(x[1])
+        actuator.rod = [float(x[0]), float(x[1])]
         actuator.hold(float(np.atleast_1d(u)[0]), T)
-        return np.array([actuator.displacement, actuator.speed])
+        return np.array(actuator.rod)
 
     def output(t, x, u, params):
-        return np.array([x[0]])
+        return np.array([actuator.displacement - actuator.rod[0] + x[0]])
 
     system = control.nlsys(update, output, inputs=["current_A"], outputs=["displacement_m"], states=["displacement_m", "speed_m_per_s"], dt=T, name="actuator")
     system.reset = actuator.reset
@@ -46,7 +47,80 @@ def actuator_system(plant: PlainActuator, T: float):
     return system
 
 
-def closed_loop(controller, extra_inputs: bool = True):
+def controller_system(controller, limit: float = np.inf, anti_windup: bool = True):
+    """A realized controller with its saturation as an `nlsys`: error_um in, control_Ms2 out within +-limit (stable plants)."""
+    import control
+
+    if controller.direct is not None:
+        raise ConfigurationError("the controller of an unstable plant has no internal model to saturate; take Controller.to_control()")
+    (Aq, Bq, Cq, Dq), (Am, Bm, Cm, _) = controller.Q, controller.model
+    n = len(Aq)
+
+    def control_of(x, u):
+        e = float(np.atleast_1d(u)[0]) + float(Cm[0] @ x[n:])
+        asked = float(Cq[0] @ x[:n] + Dq[0, 0] * e)
+        return e, asked, min(max(asked, -limit), limit)
+
+    def update(t, x, u, params):
+        e, asked, clipped = control_of(x, u)
+        return np.concatenate([Aq @ x[:n] + Bq[:, 0] * e, Am @ x[n:] + Bm[:, 0] * (clipped if anti_windup else asked)])
+
+    def output(t, x, u, params):
+        return np.array([control_of(x, u)[2]])
+
+    return control.nlsys(update, output, inputs=["error_um"], outputs=["control_Ms2"], states=n + len(Am), dt=controller.problem.T, name="K")
+
+
+def inverse_system(model: PlainActuator, T: float, middle: float = 0.5, limit: float = 2.0):
+    """The inverse (7) as a discrete `nlsys`: control_Ms2 about `middle` in, current_A out within +-limit.
+
+    Its memory is kept beside the vector of states, as in `actuator_system`.
+    """
+    import control
+
+    operator = model.operator.copy()
+    operator.solve(float(magnetization_for(model, middle)))
+
+    def current(u, memory):
+        H, M = memory.field, memory.magnetization
+        H1 = memory.solve(float(magnetization_for(model, middle + float(np.atleast_1d(u)[0]))))
+        I = (H1 + memory.magnetization - H - M) / (T * model.c1) + (H1 - model.H_bias) / model.c0
+        return min(max(I, -limit), limit)
+
+    def update(t, x, u, params):
+        current(u, operator)
+        return np.array([operator.field])
+
+    def output(t, x, u, params):
+        return np.array([current(u, operator.copy())])
+
+    system = control.nlsys(update, output, inputs=["control_Ms2"], outputs=["current_A"], states=["field_A_per_m"], dt=T, name="inverse")
+    system.start = [operator.field]
+    return system
+
+
+def tracking_loop(controller, plant: PlainActuator, model: PlainActuator, limit: float = 0.5, anti_windup: bool = True):
+    """Controller, inverse of the `model` and the hysteretic `plant` in a loop by python-control's `interconnect`.
+
+    reference_um in; displacement_m, control_Ms2, current_A out. `start` of the result is its initial state (the middle of
+    the range, at rest): `input_output_response(loop, t, reference, loop.start)`.
+    """
+    import control
+
+    T = controller.problem.T
+    inverse = inverse_system(model, T)
+    current = (inverse.start[0] - model.H_bias) / model.c0
+    actuator = actuator_system(plant, T, current)
+    K = controller_system(controller, limit, anti_windup)
+    comparison = control.ss([], [], [], [[1.0, -1e6]], dt=T, inputs=["reference_um", "displacement_m"], outputs=["error_um"], name="comparison")
+    loop = control.interconnect(
+        [comparison, K, inverse, actuator], inputs=["reference_um"], outputs=["displacement_m", "control_Ms2", "current_A"], name="tracking", dt=T
+    )
+    loop.start = np.concatenate([np.zeros(K.nstates), inverse.start, actuator.actuator.rod])
+    return loop
+
+
+def closed_loop(controller):
     """Fig. 12 by python-control's `interconnect`: reference_um and w0 in, error_um, control_Ms2 and z_um out."""
     import control
 

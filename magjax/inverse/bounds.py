@@ -37,14 +37,22 @@ def _warn(value, plant):
     return "the bound exceeds 2 M_s and says nothing: read the simulated worst case" if value > 2 * plant.operator.total else ""
 
 
-def static_bound(plant: PlainActuator, delta_I=None, mass_errors=None, density_max=None) -> Bound:
+def static_bound(plant: PlainActuator, delta_I=None, mass_errors=None, density_max=None, wanted=None) -> Bound:
     """Proposition 4.1: ||e_M|| <= delta_I M_s + 8 mu_max s0^2 / L.
 
     `delta_I`: relative error of the masses; or `mass_errors` (L, L), A/m, their standard errors from a fit, of which the
     sum takes the place of delta_I M_s (the second term of (8)). `density_max`: mu_max, A/m per (A/m)^2, the largest mass
-    over a cell if None. A mass that is zero in truth must be identified as zero. Raises `ConfigurationError` otherwise.
+    over a cell if None. `wanted`: the magnetizations to reach, A/m; they must lie in the range. With delta_I a mass that is
+    zero in truth must be identified as zero. Raises `ConfigurationError` where a condition does not hold.
     """
     operator = plant.operator
+    if wanted is not None:
+        beyond = np.abs(np.asarray(wanted, float) - operator.offset) > operator.total
+        if beyond.any():
+            raise ConfigurationError(
+                f"Prop. 4.1 needs targets within {operator.offset - operator.total:.5g} .. {operator.offset + operator.total:.5g} A/m; "
+                f"sample {int(np.argmax(beyond))} asks for {np.ravel(wanted)[np.argmax(beyond)]:.5g}"
+            )
     masses = _masses(plant)
     if (delta_I is None) == (mass_errors is None):
         raise ConfigurationError("give either delta_I (a share) or mass_errors (standard errors of the masses, A/m)")

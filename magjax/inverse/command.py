@@ -5,11 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ConfigurationError, RecordingError
-from .dynamic import KNOWN_INVERSES, SENSOR_INVERSES, PlainActuator, current_for_displacement
+from .dynamic import KNOWN_INVERSES, SENSOR_INVERSES, PlainActuator, current_for_displacement, nearest_feasible, undo_sensor
 
 
 def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict:
-    """Read time_s and displacement_m (or _um), write time_s and current_A; returns a summary."""
+    """Read time_s and displacement_m (or _um), write time_s and current_A; returns a summary.
+
+    Where the wanted displacement is not feasible a third column, displacement_m, is the nearest feasible one that the
+    current is for.
+    """
     plant = PlainActuator.from_actuator(load_actuator(bench, model))
     time, wanted = read_trajectory(Path(trajectory))
     h = float(np.median(np.diff(time)))
@@ -17,7 +21,11 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
     out = Path(out)
     partial = out.with_name(out.name + ".part")
     try:
-        np.savetxt(partial, np.stack([time, current], axis=1), delimiter=",", header="time_s,current_A", comments="", fmt="%.12g")
+        columns, names = [time, current], "time_s,current_A"
+        if infeasible.any():
+            columns.append(nearest_feasible(plant, undo_sensor(plant, wanted, h) if of_reading else wanted, h))
+            names += ",displacement_m"
+        np.savetxt(partial, np.stack(columns, axis=1), delimiter=",", header=names, comments="", fmt="%.12g")
         partial.replace(out)
     except OSError as error:
         raise ConfigurationError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
@@ -25,7 +33,7 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
     left = [e for e in plant.effects if e not in known]
     text = f"current {current.min():.4g} .. {current.max():.4g} A; wrote {out}"
     if infeasible.any():
-        text += f"; {int(infeasible.sum())} samples were not feasible (0 <= u <= M_s^2) and the nearest was taken, first at t = {time[np.argmax(infeasible)]:.4g} s"
+        text += f"; {int(infeasible.sum())} samples were not feasible (0 <= u <= M_s^2) and the nearest was taken (column displacement_m), first at t = {time[np.argmax(infeasible)]:.4g} s"
     if saturated.any():
         text += f"; {int(saturated.sum())} samples need a magnetization outside the fitted plane, first at t = {time[np.argmax(saturated)]:.4g} s"
     if left:

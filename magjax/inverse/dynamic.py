@@ -67,12 +67,14 @@ def implicit_euler(plant: PlainActuator, current, h: float, operator=None):
 def second_mode_force(plant: PlainActuator, displacement, h: float):
     """The free displacement that makes both modes together follow `displacement`, over the whole trajectory at once.
 
-    U = Y / (G + gain (G2 - 1)) on a padded FFT: the ends are held, so let the trajectory begin and end at rest.
+    U = Y / (G + gain (G2 - 1)) on a padded FFT: at rest before, and smoothly on (point-mirrored) after the end.
     """
     mode = plant.effects["second_mode"]
     y = np.asarray(displacement, float)
     pad = max(len(y), int(2.0 / (plant.f0 * h)))
-    whole = np.concatenate([np.full(pad, y[0]), y, y[-1] + (y[0] - y[-1]) * 0.5 * (1 - np.cos(np.pi * np.arange(pad) / pad))])
+    after = 2 * y[-1] - y[-2::-1]
+    back = after[-1] + (y[0] - after[-1]) * 0.5 * (1 - np.cos(np.pi * np.arange(pad) / pad))
+    whole = np.concatenate([np.full(pad, y[0]), y, after, back])
     s = 2j * np.pi * np.fft.rfftfreq(len(whole), h)
     w, w2 = 2 * np.pi * plant.f0, 2 * np.pi * mode["f2"]
     first = w**2 / (s * s + 2 * plant.xi * w * s + w**2)
@@ -97,12 +99,38 @@ def feasible_magnetization(plant: PlainActuator, displacement, h: float):
         force = np.gradient(speed, h) / w0**2 + 2 * plant.xi / w0 * speed + y
     square = force / (plant.l_rod * plant.lambda_s)
     wrong = (square < 0) | (square > 1)
-    square = np.clip(square, 0.0, 1.0)
-    if "quartic_magnetostriction" in plant.effects:  # m^2 + b (m^4 - m^2) = square, without cancellation
-        b = plant.effects["quartic_magnetostriction"]["b"]
-        root = np.sqrt(np.maximum((1 - b) ** 2 + 4 * b * square, 0.0))
-        square = np.clip(2 * square / np.maximum(1 - b + root, 1e-300), 0.0, 1.0)
-    return plant.M_s * np.sqrt(square), wrong
+    return magnetization_for(plant, square), wrong
+
+
+def magnetization_for(plant: PlainActuator, strain):
+    """M >= 0, A/m, of a strain in units of lambda_s, by the quadratic law or the plant's quartic one; the ends outside [0, 1]."""
+    strain = np.clip(strain, 0.0, 1.0)
+    b = plant.effects.get("quartic_magnetostriction", {}).get("b", 0.0)
+    if b:  # m^2 + b (m^4 - m^2) = strain, without cancellation
+        root = np.sqrt(np.maximum((1 - b) ** 2 + 4 * b * strain, 0.0))
+        strain = np.clip(2 * strain / np.maximum(1 - b + root, 1e-300), 0.0, 1.0)
+    return plant.M_s * np.sqrt(strain)
+
+
+def nearest_feasible(plant: PlainActuator, displacement, h: float):
+    """The displacement, m, that the feasible M_bar of `feasible_magnetization` really leads to, starting at rest.
+
+    Equal to `displacement` (to the differences' error) where that is feasible; offered where it is not.
+    """
+    from .events import oscillate
+
+    M, _ = feasible_magnetization(plant, displacement, h)
+    m2 = (M / plant.M_s) ** 2
+    b = plant.effects.get("quartic_magnetostriction", {}).get("b", 0.0)
+    free = plant.l_rod * plant.lambda_s * (m2 + b * (m2 * m2 - m2))
+    mode = plant.effects.get("second_mode")
+    rod, second, reached = [free[0], 0.0], [free[0], 0.0], []
+    for k, after in enumerate(free):
+        if k:
+            rod = oscillate(rod, free[k - 1], after, h, plant.f0, plant.xi)
+            second = second if mode is None else oscillate(second, free[k - 1], after, h, mode["f2"], mode["xi2"])
+        reached.append(rod[0] + (0.0 if mode is None else mode["gain"] * (second[0] - after)))
+    return np.array(reached)
 
 
 def undo_sensor(plant: PlainActuator, reading, h: float):

@@ -12,14 +12,14 @@ import math
 from ..errors import ConfigurationError
 from .dynamic import PlainActuator
 
-PLANT_EFFECTS = ("amplifier_lag", "quartic_magnetostriction")
+PLANT_EFFECTS = ("amplifier_lag", "quartic_magnetostriction", "second_mode")
 
 
 class HeldCurrent:
-    """An actuator driven by a current that is held between calls. State: `field`, the memory, `displacement`, `speed`.
+    """An actuator driven by a current that is held between calls. State: `field`, the memory, `rod` = [y, dy/dt].
 
-    `events`: how many the last call crossed. Of the effects an amplifier's lag and a quartic law are simulated (the lag
-    piecewise: its mean over each of the `pieces`); raises `ConfigurationError` for others.
+    `events`: how many the last call crossed. Of the effects an amplifier's lag (piecewise: its mean over each of the
+    `pieces`), a quartic law and a second mode are simulated; raises `ConfigurationError` for others.
     """
 
     def __init__(self, plant: PlainActuator, current: float = 0.0, pieces: int = 8):
@@ -35,7 +35,18 @@ class HeldCurrent:
         self.field = self.plant.c0 * self._start + self.plant.H_bias
         self.operator.apply(self.field)
         self.current = self._start
-        self.displacement, self.speed, self.events = self._free(), 0.0, 0
+        self.rod, self.second, self.events = [self._free(), 0.0], [self._free(), 0.0], 0
+
+    @property
+    def displacement(self) -> float:
+        """Displacement, m."""
+        mode = self.plant.effects.get("second_mode")
+        return self.rod[0] if mode is None else self.rod[0] + mode["gain"] * (self.second[0] - self._free())
+
+    @property
+    def speed(self) -> float:
+        """Speed of the first mode, m/s."""
+        return self.rod[1]
 
     @property
     def magnetization(self) -> float:
@@ -56,10 +67,13 @@ class HeldCurrent:
         """
         piece = duration / self.pieces
         before = self._free()
+        mode = self.plant.effects.get("second_mode")
         for _ in range(self.pieces):
             self.advance(self._delivered(current, piece), piece)
             after = self._free()
-            self._rod(before, after, piece)
+            self.rod = oscillate(self.rod, before, after, piece, self.plant.f0, self.plant.xi)
+            if mode is not None:
+                self.second = oscillate(self.second, before, after, piece, mode["f2"], mode["xi2"])
             before = after
         return self.displacement
 
@@ -140,21 +154,21 @@ class HeldCurrent:
             self.operator._advance(field, *branch)
         self.field = field
 
-    def _rod(self, before, after, h):
-        """Exact transition of y'' + 2 xi w y' + w^2 y = w^2 free, free straight between its ends."""
-        p = self.plant
-        w, xi = 2 * math.pi * p.f0, p.xi
-        slope = (after - before) / h
-        # subtract the particular solution free(t) - 2 xi slope / w, a straight line
-        y0, v0 = self.displacement - before + 2 * xi * slope / w, self.speed - slope
-        root = w * math.sqrt(abs(1 - xi * xi))
-        decay = math.exp(-xi * w * h)
-        if xi < 1:
-            c, s = math.cos(root * h), (math.sin(root * h) / root)
-        elif xi > 1:
-            c, s = math.cosh(root * h), (math.sinh(root * h) / root)
-        else:
-            c, s = 1.0, h
-        y = decay * (y0 * c + (v0 + xi * w * y0) * s)
-        v = decay * (v0 * c - (w * w * y0 + xi * w * v0) * s)
-        self.displacement, self.speed = y + after - 2 * xi * slope / w, v + slope
+
+def oscillate(state, before: float, after: float, h: float, f0: float, xi: float) -> list[float]:
+    """Exact transition over h (s) of y'' + 2 xi w y' + w^2 y = w^2 u from state = [y, y'], u straight from `before` to `after`."""
+    w = 2 * math.pi * f0
+    slope = (after - before) / h
+    # less the particular solution u(t) - 2 xi slope / w, a straight line
+    y0, v0 = state[0] - before + 2 * xi * slope / w, state[1] - slope
+    root = w * math.sqrt(abs(1 - xi * xi))
+    decay = math.exp(-xi * w * h)
+    if xi < 1:
+        c, s = math.cos(root * h), (math.sin(root * h) / root)
+    elif xi > 1:
+        c, s = math.cosh(root * h), (math.sinh(root * h) / root)
+    else:
+        c, s = 1.0, h
+    y = decay * (y0 * c + (v0 + xi * w * y0) * s)
+    v = decay * (v0 * c - (w * w * y0 + xi * w * v0) * s)
+    return [y + after - 2 * xi * slope / w, v + slope]

@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -25,8 +23,57 @@ def plant():
 def test_strategies_rank_as_in_the_paper(plant):
     time, wanted = sinusoid(plant, 5e-4)
     error = {s: track(plant, plant, time, wanted, s).errors()[0] for s in ("proportional", "static_inverse", "dynamic_inverse", "l1")}
-    assert error["dynamic_inverse"] < 0.3 * error["static_inverse"] < error["proportional"]
-    assert error["l1"] < error["proportional"]
+    assert error["dynamic_inverse"] < 0.05 * error["static_inverse"] < error["proportional"]
+    assert error["l1"] < error["proportional"] and error["dynamic_inverse"] < 5e-8
+
+
+@pytest.mark.parametrize(
+    ("effects", "frequency", "gain"),
+    [
+        ({"amplifier_lag": {"tau": 4e-4}}, 20.0, 5),
+        ({"quartic_magnetostriction": {"b": 0.25}}, 20.0, 50),
+        ({"second_mode": {"gain": 0.15, "f2": 180.0, "xi2": 0.1}}, 100.0, 10),
+    ],
+    ids=["amplifier_lag", "quartic", "second_mode"],
+)
+def test_knowing_what_is_concealed_pays_in_tracking(plant, effects, frequency, gain):
+    true = dataclasses.replace(plant, effects=effects)
+    time, wanted = sinusoid(plant, 1e-2 / frequency, frequency)
+    blind, told = (track(true, model, time, wanted, "dynamic_inverse").errors(0.5)[0] for model in (plant, true))
+    assert told * gain < blind
+
+
+def test_noise_reaches_feedback_only(plant):
+    time, wanted = sinusoid(plant, 5e-4, periods=3)
+    for strategy, changes in (("dynamic_inverse", False), ("l1", True), ("proportional", True)):
+        quiet, noisy = (track(plant, plant, time, wanted, strategy, noise=n) for n in (0.0, 3e-7))
+        assert (np.abs(noisy.reached - quiet.reached).max() > 1e-8) == changes
+
+
+def test_what_is_out_of_reach_is_counted(plant):
+    time, wanted = sinusoid(plant, 5e-4, periods=2)
+    for strategy in ("static_inverse", "dynamic_inverse"):
+        assert track(plant, plant, time, wanted, strategy).saturated == 0 < track(plant, plant, time, 2.5 * wanted, strategy).saturated
+
+
+def test_interconnected_loop_is_the_study(plant):
+    """The same l1 run through python-control's `interconnect`, with a wrong model."""
+    import control
+
+    from magjax.control import TrackingProblem, design
+    from magjax.control.models import tracking_loop
+    from magjax.control.problem import rod
+    from magjax.control.realize import reduced_controller
+
+    T, model = 5e-4, perturbed(plant)
+    time, wanted = sinusoid(plant, T, periods=2)
+    run = track(plant, model, time, wanted, "l1")
+    controller = reduced_controller(design(TrackingProblem(plant=rod(model.f0, model.xi, T, 1e6 * model.l_rod * model.lambda_s), T=T)))
+    loop = tracking_loop(controller, plant, model)
+    assert loop.input_labels == ["reference_um"] and loop.output_labels == ["displacement_m", "control_Ms2", "current_A"]
+    ahead = 1e6 * wanted[np.minimum(np.arange(len(time)) + 2, len(time) - 1)]
+    out = control.input_output_response(loop, time, ahead, loop.start).outputs
+    assert out[0] == pytest.approx(run.reached, abs=1e-12) and out[2] == pytest.approx(run.current, abs=1e-9)
 
 
 def test_over_relaxing_saturates_on_a_mismatched_plant(plant):
@@ -74,18 +121,26 @@ def test_lagging_amplifier_of_the_held_plant():
     assert late.current == pytest.approx(0.5 * (1 - np.exp(-1)), rel=1e-12)
 
 
-@pytest.mark.parametrize("arguments", [["design", "--json"], ["simulate", "--json", "--strategy", "dynamic_inverse", "--out", "track.csv"]])
-def test_commands(arguments, tmp_path):
-    done = subprocess.run([sys.executable, "-m", "magjax", "control", *arguments], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
-    if arguments[0] == "design":
-        assert summary["gap"] < 1e-6 and summary["hard_rows_broken"] == []
-    else:
-        assert summary["rms_m"] < 1e-6 and (tmp_path / "track.csv").exists()
+def command(arguments, capsys):
+    from magjax.cli import main
+
+    status = main(["control", *arguments])
+    return status, capsys.readouterr()
 
 
-def test_command_errors_are_one_line(tmp_path):
-    for arguments, words in ((["fly"], "no action"), (["design", "--u-bar", "-1"], "u_bar"), (["simulate", "--strategy", "x"], "unknown")):
-        done = subprocess.run([sys.executable, "-m", "magjax", "control", *arguments], cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 2 and words in done.stderr and done.stderr.count("\n") == 1
+def test_commands(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, said = command(["design", "--json"], capsys)
+    summary = json.loads(said.out)
+    assert status == 0 and summary["gap"] < 1e-6 and summary["hard_rows_broken"] == [] and "margin" in summary["message"]
+    status, said = command(["simulate", "--json", "--strategy", "dynamic_inverse", "--out", "track.csv"], capsys)
+    assert status == 0 and json.loads(said.out)["rms_m"] < 1e-7 and (tmp_path / "track.csv").exists()
+    status, said = command(["bounds", "--json", "--T", "5e-4"], capsys)
+    summary = json.loads(said.out)
+    assert "largest h that holds" in summary["4.2"]["note"] and summary["4.3"]["simulated_A_per_m"] <= summary["4.3"]["bound_A_per_m"]
+
+
+def test_command_errors_are_one_line(capsys):
+    for arguments, words in ((["fly"], "no action"), (["design", "--u-bar", "-1"], "u_bar"), (["design", "--w-bar", "0"], "w_bar"), (["simulate", "--strategy", "x"], "unknown")):
+        status, said = command(arguments, capsys)
+        assert status == 2 and words in said.err and said.err.count("\n") == 1

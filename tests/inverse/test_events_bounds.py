@@ -9,6 +9,7 @@ from magjax.effects import ExcessLoss, QuarticMagnetostriction, SecondMode, Sens
 from magjax.errors import ConfigurationError
 from magjax.inverse import PlainActuator, PlainPreisach, current_for_displacement, implicit_euler
 from magjax.inverse.bounds import backward_bound, forward_bound, simulated_worst, static_bound
+from magjax.inverse.dynamic import nearest_feasible
 from magjax.inverse.events import HeldCurrent
 from magjax.simulate import simulate
 from tests.test_simulate import actuator
@@ -154,6 +155,61 @@ def test_compensation_of_a_repaired_actuator(effect, of_reading):
         reached = np.asarray(signals.reading if of_reading else signals.displacement)
         errors.append(np.sqrt(np.mean((reached - wanted)[n // 3 : -50] ** 2)))
     assert errors[1] < 0.35 * errors[0]
+
+
+def test_targets_out_of_range_break_the_static_bound():
+    plant = plant_with(L=8)
+    top = plant.operator.offset + plant.operator.total
+    assert static_bound(plant, delta_I=0.01, wanted=[0.0, 0.99 * top]).value > 0
+    with pytest.raises(ConfigurationError, match="sample 1 asks"):
+        static_bound(plant, delta_I=0.01, wanted=[0.0, 1.01 * top])
+
+
+@pytest.mark.parametrize("effects", [{}, {"quartic_magnetostriction": {"b": 0.3}}])
+def test_nearest_feasible_displacement(effects):
+    plant = dataclasses.replace(plant_with(), effects=effects)
+    h = 2e-5
+    t = h * np.arange(3000)
+    stroke = plant.l_rod * plant.lambda_s
+    wanted = stroke * (0.5 + 0.3 * np.sin(2 * np.pi * 30 * t) * np.minimum(1, t / 0.02))
+    assert np.abs(nearest_feasible(plant, wanted, h) - wanted)[:-5].max() < 2e-3 * stroke
+    far = stroke * (0.5 + 0.8 * np.sin(2 * np.pi * 30 * t) * np.minimum(1, t / 0.02))
+    offered = nearest_feasible(plant, far, h)
+    assert offered.max() < 1.05 * stroke and offered.min() > -0.05 * stroke < np.abs(offered - far).max()
+
+
+def test_second_mode_of_the_held_plant_is_that_of_the_engine():
+    effect = SecondMode(gain=0.15, f2=180.0, xi2=0.1)
+    act = actuator(25).with_effect(effect)
+    n, h = 4000, 2e-5
+    wave = 0.3 * (1 - np.cos(2 * np.pi * 25 * h * np.arange(n)))
+    expected = np.asarray(simulate(act, wave, h).displacement)
+    held, got = HeldCurrent(PlainActuator.from_actuator(act), pieces=2), []
+    for k in range(n):
+        got.append(held.displacement)
+        held.hold(0.5 * float(wave[k] + wave[min(k + 1, n - 1)]), h)
+    assert np.abs(np.array(got) - expected).max() < 2e-3 * np.ptp(expected)
+
+
+def test_errors_of_a_fit_in_the_static_bound():
+    """Hats with known covariance: masses = total cells @ x, their errors as a Monte Carlo gives them."""
+    from types import SimpleNamespace
+
+    from fitting.inversion import inversion_bound, mass_errors
+
+    rng = np.random.default_rng(0)
+    act = actuator(25)
+    cells = np.tril(np.ones((25, 25))).reshape(-1, 1) * rng.random((625, 3))
+    root = rng.standard_normal((4, 4))
+    spread = root @ root.T + np.eye(4)
+    layout = SimpleNamespace(density_unknowns=3, cells=cells, total=2.0)
+    solution = SimpleNamespace(normal=np.linalg.inv(spread), z=np.ones(4))
+    result = SimpleNamespace(problem=SimpleNamespace(layout=layout), solution=solution, actuator=act)
+    errors = mass_errors(result)
+    draws = 1.3 * 2.0 * rng.multivariate_normal(np.zeros(3), spread[:3, :3], 20000) @ cells.T
+    assert errors.ravel() == pytest.approx(draws.std(axis=0), rel=0.05, abs=1e-12)
+    bound = inversion_bound(result)
+    assert bound.value - static_bound(PlainActuator.from_actuator(act), delta_I=0.0).value == pytest.approx(errors.sum())
 
 
 def test_names_of_the_plain_actuator():
