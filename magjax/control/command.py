@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ConfigurationError
-from .l1 import TrackingProblem, design
+from .l1 import TrackingProblem, design, knee
 from .problem import M_S, rod, weight
 from .realize import reduced_controller
 from .tracking import STRATEGIES, aperiodic, compare, perturbed, sinusoid, track
@@ -72,6 +72,12 @@ def design_figures(plant, options, folder) -> Path:
         ax.set(xlabel=label, title=title)
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("gamma*, um")
+    try:
+        reach = knee(_problem(plant, options))[0]
+        axes[2].axvline(reach, color="0.5", ls=":", label=f"knee {reach:.3g} (T&B: about 4.5)")
+        axes[2].legend(fontsize=8)
+    except ConfigurationError:  # no closed form where the sampled rod is not minimum phase
+        axes[2].set_title("Fig. 15: saturation (no closed-form knee)")
     figure.suptitle(f"l1 designs with the printed constants and an assumed hold at T = {options.T * 1e3:g} ms (the paper does not state T)", fontsize=10)
     path = folder / "l1_figures.png"
     figure.savefig(path, dpi=130)

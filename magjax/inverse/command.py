@@ -70,4 +70,12 @@ def read_trajectory(path):
     for quantity, usual in (("time", "time_s"), ("displacement", "displacement_m")):
         if quantity not in found:
             raise RecordingError(f"{path}: no {quantity} column among {', '.join(table)}; name it {usual}")
-    return found["time"], found["displacement"]
+    time, wanted = found["time"], found["displacement"]
+    steps = np.diff(time)
+    if len(time) < 4 or not np.all(np.isfinite(wanted)):
+        raise RecordingError(f"{path}: needs at least four samples and no gaps in displacement; fill or cut them")
+    uneven = np.abs(steps - np.median(steps)) > 1e-3 * abs(np.median(steps))
+    if uneven.any() or not np.median(steps) > 0:
+        k = int(np.argmax(uneven))
+        raise RecordingError(f"{path}: time is not uniform at sample {k + 1} (step {steps[k]:.6g} s, usually {np.median(steps):.6g}); resample it")
+    return time, wanted

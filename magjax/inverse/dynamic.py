@@ -148,20 +148,22 @@ def undo_sensor(plant: PlainActuator, reading, h: float):
     return y
 
 
-def current_for_displacement(plant: PlainActuator, displacement, h: float, of_reading: bool = False):
+def current_for_displacement(plant: PlainActuator, displacement, h: float, of_reading: bool = False, accelerate: bool = False):
     """The current to apply, A, by the inverse (7), with the secant of M: exact for the implicit Euler model.
 
-    `of_reading`: the trajectory is wanted of the sensor's reading, whose lag and delay are then undone. Returns
+    `of_reading`: the trajectory is wanted of the sensor's reading, whose lag and delay are then undone; `accelerate`:
+    the operator is inverted by the compiled walk (needs numba; the same numbers). Returns
     (current, infeasible samples, saturated samples). Of the effects, those in `KNOWN_INVERSES` are compensated.
     """
     wanted, infeasible = feasible_magnetization(plant, undo_sensor(plant, displacement, h) if of_reading else displacement, h)
     operator = plant.operator.copy()
-    fields, magnetizations, saturated = [], [], []
-    for m in wanted:
-        fields.append(operator.solve(float(m)))
-        magnetizations.append(operator.magnetization)
-        saturated.append(operator.saturated)
-    H, M = np.array(fields), np.array(magnetizations)
+    if accelerate:
+        from .accelerated import invert_many
+
+        H, M, saturated, _ = invert_many(operator, wanted)
+    else:
+        steps = [(operator.solve(float(m)), operator.magnetization, operator.saturated) for m in wanted]
+        H, M, saturated = (np.array(column) for column in zip(*steps, strict=True))
     rate = np.concatenate([[0.0], np.diff(H + M)]) / h
     current = rate / plant.c1 + (H - plant.H_bias) / plant.c0
     if "excess_loss" in plant.effects:
@@ -170,4 +172,4 @@ def current_for_displacement(plant: PlainActuator, displacement, h: float, of_re
         current = current + e["k"] * flux_rate / (flux_rate**2 + e["rate_knee"] ** 2 + 1e-12) ** 0.25 / plant.c0
     if "amplifier_lag" in plant.effects:
         current = current + plant.effects["amplifier_lag"]["tau"] * np.concatenate([[0.0], np.diff(current)]) / h
-    return current, infeasible, np.array(saturated)
+    return current, infeasible, saturated

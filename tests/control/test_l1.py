@@ -50,8 +50,18 @@ def test_pure_sensitivity_is_exact_in_rationals(zeros, poles, value):
     assert all(sum(s * Fraction(p) ** k for k, s in found.S.items()) == 0 for p in poles)
 
 
+def test_repeated_points_bring_their_derivatives():
+    """lambda^2/(1 - 2 lambda): S = 1 + 0 lambda + s2 lambda^2 + ... must vanish at 1/2, so that s2 = -4: 5."""
+    found = optimal_sensitivity((0, 0), ("1/2",))
+    assert found.exact and found.value == 5 and found.S[2] == -4
+    once, twice = optimal_sensitivity((0, "1/2")), optimal_sensitivity((0, "1/2", "1/2"), ("-2/3",))
+    assert once.exact and once.value == 1 and twice.exact and twice.value > 1
+    slope = sum(k * s * Fraction(1, 2) ** (k - 1) for k, s in twice.S.items() if k)
+    assert slope == 0 and sum(s * Fraction(1, 2) ** k for k, s in twice.S.items()) == 1
+
+
 def test_wrong_interpolation_points_are_refused():
-    for zeros, poles, words in (((2,), (), "unit disc"), ((0, 0), (), "repeated"), (("1/2",), ("1/2",), "repeated")):
+    for zeros, poles, words in (((2,), (), "unit disc"), ((0.5j,), (), "real"), (("1/2",), ("1/2",), "on a zero")):
         with pytest.raises(ConfigurationError, match=words):
             optimal_sensitivity(zeros, poles)
 

@@ -1,5 +1,7 @@
 """Exact inversion, the implicit step and the inverse (7), against the operator and against the JAX engine."""
 
+import importlib.util
+
 import numpy as np
 import pytest
 
@@ -135,5 +137,25 @@ def test_open_loop_tracking():
     for model, better in ((plant, False), (late, True)):
         error = np.asarray(simulate(behind, current_for_displacement(model, wanted, h)[0], h).displacement) - wanted
         assert (np.abs(error[n // 4 : -20]).max() < 0.3e-6) == better
+    if importlib.util.find_spec("numba"):
+        assert np.array_equal(current_for_displacement(plant, wanted, h, accelerate=True)[0], current)
     far, infeasible, _ = current_for_displacement(plant, 3 * wanted, h)
     assert infeasible.any() and np.all(np.isfinite(far))
+
+
+def test_invert_command_offers_the_nearest_and_refuses_uneven_time(tmp_path, capsys):
+    from magjax.cli import main
+
+    t = 1e-4 * np.arange(600)
+    far = 33.0 + 60.0 * np.sin(2 * np.pi * 20 * t) * np.minimum(1, t / 0.02)
+    uneven = t.copy()
+    uneven[300] += 5e-5
+    for name, time, wanted in (("far", t, far), ("near", t, 33.0 + 0.1 * (far - 33.0)), ("uneven", uneven, far)):
+        np.savetxt(tmp_path / f"{name}.csv", np.stack([time, wanted], axis=1), delimiter=",", header="time_s,displacement_um", comments="")
+    out = tmp_path / "current.csv"
+    assert main(["invert", str(tmp_path / "far.csv"), "--out", str(out)]) == 0
+    assert "not feasible" in capsys.readouterr().out and out.read_text().startswith("time_s,current_A,displacement_m")
+    assert main(["invert", str(tmp_path / "near.csv"), "--out", str(out)]) == 0
+    assert out.read_text().startswith("time_s,current_A\n")
+    assert main(["invert", str(tmp_path / "uneven.csv"), "--out", str(out)]) == 3
+    assert "not uniform at sample 300" in capsys.readouterr().err
