@@ -63,6 +63,10 @@ def inspect(recording, bench) -> Card:
         _judge_repeats(recording, x, y, f, facts, problems)
     H = _applied(bench, x)
     facts["visited plane"] = f"applied field {H.min():.5g} .. {H.max():.5g} A/m"
+    whole = _plane(bench)
+    if whole is not None:
+        share = min((H.max() - H.min()) / (whole[1] - whole[0]), 1.0) ** 2
+        facts["visited plane"] += f", {share:.0%} of the relays that the bench's limits reach"
     limit = bench.limits.get("current_A" if bench.drive == "current" else "field_A_per_m")
     if limit and np.abs(x).max() > 1.02 * limit:
         facts["limit"] = f"the drive passes the bench's limit of {limit:g}; widen [limits] if that is meant"
@@ -73,6 +77,15 @@ def _applied(bench, x):
     if bench.drive == "field":
         return x
     return bench.constants.get("coil.c0", 1.0) * x + bench.constants.get("coil.H_bias", 0.0)
+
+
+def _plane(bench):
+    """The range of applied field that the bench's limits reach, A/m, or None where none are stated."""
+    limit = bench.limits.get("current_A" if bench.drive == "current" else "field_A_per_m")
+    if not limit:
+        return None
+    ends = _applied(bench, np.array([-limit, limit]))
+    return float(ends[0]), float(ends[1])
 
 
 def _judge_repeats(recording, x, y, f, facts, problems):

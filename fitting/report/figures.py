@@ -114,6 +114,32 @@ def ranking(diagnosis, folder, stem="ranking"):
     return _save(plt, figure, folder, stem)
 
 
+def paper_loops(families, folder, stem="paper_loops"):
+    """Displacement against current: name of the range -> list of (frequency, current, displacement)."""
+    plt = _plotting()
+    figure, axes = plt.subplots(1, len(families), figsize=(9, 3.8), sharey=True, layout="constrained")
+    for ax, (name, loops_of) in zip(axes, families.items(), strict=True):
+        for k, (f, current, y) in enumerate(loops_of):
+            ax.plot(current, y * 1e6, color=plt.cm.viridis(k / len(loops_of)), lw=1, label=f"{f:g} Hz")
+        ax.set(title=name, xlabel="current, A")
+    axes[0].set_ylabel("displacement, um")
+    axes[-1].legend(fontsize=7, loc="upper left")
+    _save(plt, figure, folder, stem)
+
+
+def lag_table(table, folder, stem="lag_table"):
+    """xi against frequency for each R_eddy, as T&B Fig. 6."""
+    plt = _plotting()
+    figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
+    for k, (R, row) in enumerate(zip(table.resistances, table.xi, strict=True)):
+        picked = R == table.R_eddy
+        ax.plot(table.frequencies, row, "o-", ms=3, lw=2.2 if picked else 0.8, color="black" if picked else plt.cm.viridis(k / len(table.xi)))
+        if k % 2 == 0 or picked:
+            ax.annotate(f"{R:g} ohm", (table.frequencies[0], row[0]), fontsize=6, textcoords="offset points", xytext=(-34, -2))
+    ax.set(xlabel="frequency, Hz", ylabel="damping ratio xi", ylim=(0, 1.6), xlim=(-25, None))
+    _save(plt, figure, folder, stem)
+
+
 def _save(plt, figure, folder, stem):
     figure.savefig(folder / f"{stem}.png", dpi=140)
     path = folder / f"{stem}.svg"

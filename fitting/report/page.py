@@ -14,6 +14,8 @@ ALT = {
     "loops_after": "The same with the repaired model.",
     "masses": "Identified Preisach masses over the plane; cells that no recording switches are hatched.",
     "misfit": "Squared misfit over noise for each recording and harmonic, before any repair.",
+    "paper_loops": "Displacement against current at seven frequencies for two ranges of current, with the paper's constants.",
+    "lag_table": "Damping ratio from the phase lag against frequency, one line for each R_eddy of the mesh; the picked one is bold.",
     "ranking": "Scores of the catalogue's effects on the misfit of the plain model.",
 }
 
@@ -58,8 +60,6 @@ def _figure_folder(folder):
 
 def rebuild(folder: Path) -> Path:
     """Build report.html of a result folder again from its JSON and figures."""
-    from jinja2 import Environment
-
     folder = Path(folder)
     for name in ("diagnosis", "fit"):
         path = folder / f"{name}.json"
@@ -69,13 +69,20 @@ def rebuild(folder: Path) -> Path:
     else:
         raise ConfigurationError(f"{folder}: holds no fit.json or diagnosis.json; give a folder that magjax fit or diagnose wrote")
     page = _diagnosis_page(content, folder) if name == "diagnosis" else _fit_page(content, folder)
+    return render(folder / "report.html", page, content.get("reproduce", ""))
+
+
+def render(target: Path, page: dict, reproduce: str) -> Path:
+    """Write one page from its sections."""
+    from jinja2 import Environment
+
     template = Environment(autoescape=True).from_string((Path(__file__).parent / "page.html").read_text(encoding="utf-8"))
-    target = folder / "report.html"
-    write_atomically(target, template.render(**page, reproduce=content.get("reproduce", "")))
+    write_atomically(target, template.render(**page, reproduce=reproduce))
     return target
 
 
-def _figure(folder, stem):
+def inline(folder, stem):
+    """The figure of that stem as inline SVG with its alternative text, empty where it was not drawn."""
     path = folder / "figures" / f"{stem}.svg"
     if not path.exists():
         return {}
@@ -119,9 +126,9 @@ def _fit_page(fit, folder):
     sections = [
         {"title": "Parameters", "table": _parameter_table(fit)},
         {"title": "Recordings", "table": _recording_table(fit)},
-        {"title": "Loops", **_figure(folder, "loops")},
-        {"title": "Where the misfit sits", **_figure(folder, "misfit")},
-        {"title": "Density", **_figure(folder, "masses")},
+        {"title": "Loops", **inline(folder, "loops")},
+        {"title": "Where the misfit sits", **inline(folder, "misfit")},
+        {"title": "Density", **inline(folder, "masses")},
         {"title": "Correlations", "table": {"head": ["pair", "correlation"], "rows": [[k, _g(v, 3)] for k, v in fit["correlations"].items()]}},
     ]
     if fit.get("check"):
@@ -151,15 +158,15 @@ def _diagnosis_page(found, folder):
         sections.append({"title": "Not told apart by these recordings", "table": {"head": ["rivals, most likely first"], "rows": rows}})
     if found["next_experiment"]:
         sections.append({"title": "Next experiment", "text": found["next_experiment"]["text"]})
-    sections.append({"title": "Where", **_figure(folder, "misfit")})
+    sections.append({"title": "Where", **inline(folder, "misfit")})
     ranked = [
         [c["name"], _g(c["z"], 3), _g(c["visibility"], 2), _g(c["amplitude"], 3), _g(c["smallest_visible"], 3), _g(c["achieved_chi2_drop"])]
         for c in found["candidates"]
     ]
     head = ["effect", "z", "visibility", "amplitude", "visible from", "chi2 gained"]
-    sections.append({"title": "Ranking", **_figure(folder, "ranking"), "table": {"head": head, "rows": ranked}})
-    sections.append({"title": "Before", **_figure(folder, "loops")})
-    sections.append({"title": "After", **_figure(folder, "loops_after")})
+    sections.append({"title": "Ranking", **inline(folder, "ranking"), "table": {"head": head, "rows": ranked}})
+    sections.append({"title": "Before", **inline(folder, "loops")})
+    sections.append({"title": "After", **inline(folder, "loops_after")})
     if found["floors"]:
         rows = [[k, _g(v, 3)] for k, v in found["floors"].items()]
         sections.append({"title": "Floors", "table": {"head": ["floor", "rms"], "rows": rows}})

@@ -127,9 +127,17 @@ def run_demo(arguments) -> int:
     """magjax demo."""
     p = parser("demo", "Invent a bench with concealed physics, record it with noise, fit it, diagnose it, write the report.", "magjax demo --out demo")
     p.add_argument("--out", default="magjax-demo", help="folder for recordings and results (default magjax-demo)")
+    p.add_argument("--paper", action="store_true", help="instead: T&B's loops with their constants, and their recipe for R_eddy and xi (Figs. 6-8)")
     options = p.parse_args(arguments)
     prepare_jax()
     folder = output_folder(options.out)
+    if options.paper:
+        from fitting.paper import run_paper
+
+        with Progress(options.quiet or options.json):
+            content = run_paper(folder, options.seed)
+        print(json.dumps(content) if options.json else f"{content['message']}\n\nresults in {folder} (paper.html, paper.json)")
+        return 0
     from fitting.demo import run_demo as demo
 
     with Progress(options.quiet or options.json) as progress:

@@ -1,0 +1,125 @@
+"""What relays remember that a recording never reaches: start states, the static path, the fit that finds them."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fitting.density import hat_basis
+from fitting.fit import fit
+from fitting.recipe import lag_recipe
+from fitting.setup import Choices
+from fitting.starts import unreached_row
+from magjax.bench import load_bench
+from magjax.errors import ConfigurationError
+from magjax.preisach import Preisach, density_masses
+from magjax.preisach.static import static_magnetization, static_path, static_value_and_gradient
+from magjax.recording import Recording
+from magjax.simulate import run_chain, simulate
+
+LOW, HIGH, L = -1000.0, 1000.0, 20
+
+
+def masses_of(seed=0, level=L):
+    rng = np.random.default_rng(seed)
+    masses = np.tril(rng.random((level, level)))
+    return masses / masses.sum()
+
+
+def loop(amplitude, offset, n=200):
+    return offset + amplitude * np.sin(2 * np.pi * np.arange(n + 1) / n)
+
+
+@pytest.mark.parametrize("rest", [-400.0, 0.0, 130.0, 650.0])
+@pytest.mark.parametrize(("amplitude", "offset"), [(300.0, 0.0), (300.0, 200.0), (500.0, -300.0)])
+def test_unreached_relays_equal_a_finely_decaying_history(rest, amplitude, offset):
+    plain = Preisach(masses_of(), LOW, HIGH)
+    rested = Preisach(masses_of(), LOW, HIGH, rest=rest)
+    field = np.tile(loop(amplitude, offset), 3)
+    heights = max(rest - LOW, HIGH - rest) * (1 - np.arange(300) / 300)
+    history = np.clip(rest + heights * (-1.0) ** np.arange(300), LOW, HIGH)
+    slow = Preisach(masses_of(), LOW, HIGH, 0.0, np.append(history, rest))
+    expected = np.asarray(slow.magnetization(jnp.asarray(field), corners=170))[-100:]
+    got = np.asarray(plain.magnetization(jnp.asarray(field)))[-100:] + float(rested.unreached(field.max(), field.min()))
+    assert np.abs(got - expected).max() < 5e-3
+    assert np.ptp(got - expected) < 1e-12
+    written_out = np.asarray(rested.rested(60).magnetization(jnp.asarray(field), corners=50))[-100:]
+    assert np.abs(written_out - expected).max() < 4e-2
+
+
+def test_ends_of_rest_are_the_saturations():
+    top, bottom = Preisach(masses_of(), LOW, HIGH, rest=HIGH), Preisach(masses_of(), LOW, HIGH)
+    assert float(bottom.unreached(100.0, -100.0)) == 0.0
+    field = jnp.asarray(np.tile(loop(300.0, 50.0), 2))
+    positive = Preisach(masses_of(), LOW, HIGH, 0.0, "positive_saturation").magnetization(field)[-50:]
+    assert np.asarray(bottom.magnetization(field)[-50:] + top.unreached(field.max(), field.min())) == pytest.approx(np.asarray(positive), abs=1e-12)
+
+
+def test_rows_of_the_fit_say_the_same():
+    basis = hat_basis(-900.0, 900.0, 1.0, 16, 6, 5)
+    x = np.random.default_rng(1).random(basis.unknowns)
+    operator = Preisach(basis.masses(x), basis.low, basis.high, rest=120.0)
+    assert unreached_row(basis, 400.0, -300.0, 120.0) @ x == pytest.approx(float(operator.unreached(400.0, -300.0)), rel=1e-12)
+
+
+@pytest.mark.parametrize("level", [7, 40])
+def test_static_path_is_the_operator_and_its_gradient(level):
+    rng = np.random.default_rng(2)
+    masses = jnp.asarray(masses_of(3, level))
+    fields = (rng.uniform(LOW, HIGH, 300), np.repeat(rng.choice(np.linspace(LOW, HIGH, level + 1), 80), 2), loop(700, 100))
+    for field in fields:
+        path = static_path(field, LOW)
+        got = static_magnetization(masses, LOW, HIGH, 0.1, path)
+        assert np.abs(got - Preisach(masses, LOW, HIGH, 0.1).magnetization(field, corners=90)).max() < 1e-13
+    run = static_value_and_gradient(lambda M: jnp.sum(M**3), LOW, HIGH, 0.1, path)
+    _, gradient = run(masses)
+    step = 1e-6 * np.eye(level * level)[5 * level // 2 // level * level].reshape(level, level)
+    difference = (run(masses + step)[0] - run(masses - step)[0]) / 2e-6
+    assert float(jnp.sum(gradient * step) / 1e-6) == pytest.approx(float(difference), rel=1e-6, abs=1e-9)
+    with pytest.raises(ConfigurationError, match="finite"):
+        static_path([0.0, np.nan], LOW)
+
+
+def recordings_from(start, noise=40e-9, seed=0):
+    """Six sines of a smooth bench that began demagnetized about the field at rest."""
+    bench = load_bench("aa-050h")
+    low, high = -2.9e3, 2.75e4
+    masses = density_masses(lambda s, r: np.exp(-(((s - 9e3) / 7e3) ** 2)) / (1 + (r / 7000) ** 2), 60, low, high, 3e5)
+    hysteresis = Preisach(masses, low, high, 4e5, rest=start)
+    actuator = dataclasses.replace(bench.actuator().replace({"coil.R_eddy": 62.0, "mechanics.xi": 0.8}), hysteresis=hysteresis)
+    rng = np.random.default_rng(seed)
+    made = []
+    for f, A, b in ((10, 0.8, 0.1), (20, 0.3, -0.4), (30, 0.6, 0.2), (50, 0.3, 0.4), (100, 0.8, 0.0), (150, 0.4, -0.3), (200, 0.5, 0.2), (300, 0.6, -0.1)):
+        current = b + A * np.sin(2 * np.pi * np.arange(500) / 500)
+        dt = 1 / (f * 500)
+        reading = np.tile(np.asarray(run_chain(actuator, jnp.asarray(current), dt, 4, 4).reading), 4)
+        channels = {"current": np.tile(current, 4), "displacement": reading + noise * rng.standard_normal(reading.size)}
+        made.append(Recording(dt * np.arange(reading.size), channels, {}, {}, f"{f} Hz"))
+    return made, bench
+
+
+def test_the_fit_finds_a_demagnetized_start():
+    made, bench = recordings_from(1.23e4)
+    found = fit(made, bench, refine=False)
+    assert found.choices.rest == "demagnetized" and found.chi2_per_sample < 1.1
+    resistance = found.estimate("coil.R_eddy")
+    assert abs(resistance.value - 62.0) < 3 * resistance.stderr + 0.1
+    wrong = fit(made, bench, choices=Choices(rest="negative"), refine=False)
+    assert wrong.chi2_per_sample > 3
+
+
+def test_the_recipe_of_section_2_3():
+    actuator = load_bench("aa-050h").actuator()
+    made = []
+    for f in (20, 60, 120, 250):
+        current = 0.1 + 0.8 * np.sin(2 * np.pi * np.arange(800) / 800)
+        y = np.tile(np.asarray(simulate(actuator, current, 1 / (800 * f), periodic=True).reading), 2)
+        made.append(Recording(np.arange(1600) / (800 * f), {"current": np.tile(current, 2), "displacement": y}, {}, {}, f"{f}"))
+    table = lag_recipe(made, actuator, np.arange(50.0, 95.0, 10.0))
+    assert table.R_eddy == 70.0 and table.damping_ratio == pytest.approx(0.7783, abs=2e-3)
+    assert np.argsort(table.variance)[0] == 2 and table.xi.shape == (5, 4)
+    with pytest.raises(ConfigurationError, match="two frequencies"):
+        lag_recipe(made[:1], actuator, [60.0, 70.0])
+    with pytest.raises(ConfigurationError, match="mesh"):
+        lag_recipe(made, actuator, [70.0])
