@@ -1,43 +1,43 @@
 """Suites of concealed benches: what is hidden, how strongly, on which density, with which instruments.
 
-Every case follows from its suite and number alone; its label is written apart from its recordings, and the labels' hash
-is printed before a run.
+A case follows from its suite and number alone. Labels are told apart from recordings, and their hash per suite stands in
+SEALS.json before a run: `python -m tests.blind.cases seal` writes it, `... write dev 3 FOLDER` writes one case's recordings.
 """
 
+import argparse
 import dataclasses
+import functools
 import hashlib
 import json
 from pathlib import Path
 
 import numpy as np
 
-from .bench import ConcealedBench
+from .generator.bench import ConcealedBench
+from .generator.density import KINDS
+from .generator.instruments import record
+from .strengths import BLOCK_OF_OUTSIDE, FAULTS, HIDDEN, LEVELS, OUTSIDE, VISIBLE
 
-# strong changes the displacement by some per cent, weak by some tenths of a per cent
-STRENGTHS = {
-    "amplifier_lag": (6e-5, 1.5e-5), "sensor_lag": (1.5e3, 8e3), "transport_delay": (1e-4, 1.5e-5), "excess_loss": (25.0, 3.0),
-    "magnetic_aftereffect": (2e-3, 3e-4), "quartic_magnetostriction": (0.15, 0.02), "duffing_stiffness": (0.06, 0.01),
-    "delta_e": (0.06, 0.01), "coulomb_friction": (0.02, 0.004), "second_mode": (0.04, 0.008), "structural_damping": (0.04, 0.008),
-    "creep": (0.03, 0.005), "inductive_crosstalk": (1e-9, 1.5e-10), "sensor_nonlinearity": (0.05, 0.008), "zero_drift": (2e-6, 4e-7),
-    "thermal_drift": (3e-6, 6e-7), "mains_hum": (6e-7, 1e-7), "linear_strain": (0.03, 0.005), "mean_field": (4e-3, 6e-4),
-}  # fmt: skip
-SUITES = {"dev": 40, "val": 40, "test": 150}
-DENSITIES = ("smooth", "lobes", "heavy", "rough")
+SEALS = Path(__file__).with_name("SEALS.json")
+SUITES = {"dev": 1, "val": 2, "test": 3}
+FREQUENCIES = (10, 25, 50, 80, 120, 160, 200, 250, 300)
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One concealed bench. `effects`: name -> strength; `kind`: null, single, pair, outside, hidden."""
+    """One concealed bench. `kind`: null, decoy, single, pair, outside, hidden or data."""
 
     suite: str
     number: int
     kind: str
+    level: str
     effects: dict
-    strength: str
     density: str
     start: str
     truth: dict
-    noise: float
+    instruments: dict
+    drives: tuple
+    checks: tuple
     seed: int
 
     @property
@@ -46,89 +46,151 @@ class Case:
         return f"{self.suite}-{self.number:03d}"
 
     def label(self) -> dict:
-        """What the scorer may see after the run."""
-        return {"name": self.name, "kind": self.kind, "effects": self.effects, "strength": self.strength, "density": self.density, "truth": self.truth}
+        """Everything the generator knows."""
+        return dataclasses.asdict(self)
+
+
+def _plan(suite):
+    """(kind, names, level) of every case, in an order that tells nothing."""
+    rng = np.random.default_rng(7000 + SUITES[suite])
+    large = suite == "test"
+    rows = [("null", (), "")] * (28 if large else 8) + [("decoy", (k,), "") for k in ("coarse", "noisy", "hum", "clock")] * (
+        3 if large else 1
+    )
+    for name in VISIBLE:
+        rows += [("single", (name,), level) for level in (LEVELS if large else (LEVELS[rng.integers(3)],))]
+    for _ in range(20 if large else 6):
+        a, b = rng.choice(list(VISIBLE), 2, replace=False)
+        rows.append(("pair", (str(a), str(b)), LEVELS[rng.integers(1, 3)]))
+    outside = [(n, level) for level in ("strong", "mid", "weak") for n in OUTSIDE][: 13 if large else 5]
+    rows += [("outside", (n,), level) for n, level in outside]
+    rows += [("hidden", (n,), level) for n in HIDDEN for level in (LEVELS + ("mid",) if large else ("mid",))]
+    rows += [("data", (f,), "") for f in FAULTS] * (2 if large else 1)
+    return [rows[k] for k in rng.permutation(len(rows))]
+
+
+@functools.cache
+def plan(suite: str) -> tuple:
+    """The suite's cases in their order, as (kind, names, level)."""
+    return tuple(_plan(suite))
+
+
+def size(suite: str) -> int:
+    """How many cases a suite has."""
+    return len(plan(suite))
 
 
 def make_case(suite: str, number: int) -> Case:
-    """The case of a number: every fourth is a null, every eighth a pair, every fifteenth outside the catalogue."""
-    seed = list(SUITES).index(suite) * 100_000 + number
+    """The case of a number."""
+    kind, names, level = plan(suite)[number]
+    seed = SUITES[suite] * 100_000 + number
     rng = np.random.default_rng(seed)
-    names = [n for n in STRENGTHS if n not in ("mean_field", "linear_strain")]
-    weak = bool(rng.integers(2))
-    density, start = DENSITIES[rng.integers(4)], ("saturated", "demagnetized")[rng.integers(2)]
+    strengths = {**VISIBLE, **HIDDEN, **OUTSIDE}
+    effects = {n: _round(_strength(n, strengths[n][LEVELS.index(level)], rng)) for n in names} if level else {}
+    truth = {
+        "R_eddy": rng.uniform(45, 130),
+        "f0": rng.uniform(340, 700),
+        "xi": rng.uniform(0.3, 0.9),
+        "H_bias": 1.23e4,
+        "f2": rng.uniform(650, 1500),
+        "xi2": rng.uniform(0.02, 0.08),
+    }
+    instruments = {
+        "samples": 1000,
+        "rate": 0.0,
+        "noise": _round(rng.uniform(35e-9, 50e-9)),
+        "pink": _round(rng.uniform(0, 12e-9)),
+        "bits": 16,
+        "readback": _round(rng.choice([0.0, 2e-4])),
+    }
+    if rng.uniform() < 0.1:
+        instruments["rate"] = 25600.0
+    if kind == "decoy":
+        instruments |= {
+            "coarse": {"samples": 200, "bits": 12},
+            "noisy": {"noise": 1.5e-7, "pink": 6e-8},
+            "hum": {},
+            "clock": {"rate": 20000.0},
+        }[names[0]]
+        effects = {"mains_hum": 1.2e-8} if names[0] == "hum" else {}
+    if kind == "data":
+        instruments |= {"fault": names[0], "rate": 0.0}
+    high, low = _round(rng.uniform(0.75, 0.85)), _round(rng.uniform(0.38, 0.5))
+    offset = _round(rng.uniform(0.0, 0.12))
+    order = rng.permutation([high] * 5 + [low] * 4)
+    order[0] = high  # the slowest one spans the plane
+    drives = tuple(
+        {"frequency": float(f), "amplitude": float(a), "offset": offset} for f, a in zip(FREQUENCIES, order, strict=True)
+    )
+    checks = (
+        {"frequency": 400.0, "amplitude": 0.6, "offset": offset},
+        {"frequency": 20.0, "amplitude": 0.45, "offset": offset, "extra": ((2, 0.3, 1.0), (5, 0.25, 2.0))},
+        {
+            "frequency": 15.0,
+            "amplitude": 0.35,
+            "offset": offset,
+            "silent": True,
+            "extra": ((5, 0.4, 0.0), (6, 1.0, 0.0), (7, 0.4, 0.0)),
+        },
+    )
+    return Case(
+        suite, number, kind, level, effects, str(rng.choice(KINDS)), str(rng.choice(["demagnetized", "negative", "positive"])),
+        {k: _round(v) for k, v in truth.items()}, instruments, drives, checks, seed,
+    )  # fmt: skip
 
-    def pick(name):
-        return float(STRENGTHS[name][weak] * rng.uniform(0.7, 1.4))
 
-    if number % 4 == 0:
-        kind, effects = "null", {}
-    elif number % 8 == 3:
-        a, b = rng.choice(len(names), 2, replace=False)
-        kind, effects = "pair", {names[a]: pick(names[a]), names[b]: pick(names[b])}
-    elif number % 15 == 2:
-        kind, effects = "outside", {"hidden_bump": float(5e-7 * rng.uniform(0.7, 2))}
-    elif number % 15 == 7:
-        name = ("mean_field", "linear_strain")[rng.integers(2)]
-        kind, effects = "hidden", {name: pick(name)}
-    else:
-        name = names[rng.integers(len(names))]
-        kind, effects = "single", {name: pick(name)}
-    truth = {"R_eddy": rng.uniform(50, 120), "f0": rng.uniform(320, 600), "xi": rng.uniform(0.35, 0.9), "H_bias": 1.23e4}
-    return Case(suite, number, kind, effects, "weak" if weak else "strong", density, start, truth, float(rng.uniform(25e-9, 60e-9)), seed)
+def _strength(name, value, rng):
+    # a limit is stronger where it is smaller and acts at once: a narrow range
+    return value * (rng.uniform(0.97, 1.03) if name == "amplifier_clipping" else rng.uniform(0.8, 1.25))
 
 
-def drives_of(case: Case):
-    """Nine sines to fit and two recordings to check: frequency, amplitude, offset."""
-    rng = np.random.default_rng(case.seed + 7)
-    rows = []
-    for f in (10, 25, 50, 80, 120, 160, 200, 250, 300):
-        amplitude = float(rng.choice([0.4, 0.8]))
-        rows.append({"frequency": f, "amplitude": amplitude, "offset": float(rng.uniform(-0.1, 0.15))})
-    rows[0]["amplitude"], rows[-1]["amplitude"] = 0.8, 0.8
-    check = [
-        {"frequency": 65, "amplitude": 0.6, "offset": 0.05},
-        {"frequency": 40, "amplitude": 0.45, "offset": 0.0, "extra": ((3, 0.35, 1.0), (5, 0.2, 2.0))},
-    ]
-    return rows, check
+def _round(x):
+    return float(f"{float(x):.5g}")
+
+
+def bench_of(case: Case) -> ConcealedBench:
+    """The concealed bench itself."""
+    return ConcealedBench(case.truth, case.effects, case.density, case.start, np.random.default_rng(case.seed + 10**6))
+
+
+def recordings_of(case: Case):
+    """(name, time, current, displacement) of the recordings to fit, then of those to check."""
+    rows = [*case.drives, *case.checks]
+    settled = bench_of(case).run(rows)
+    rng = np.random.default_rng(case.seed + 2 * 10**6)
+    for k, drive in enumerate(rows):
+        one = {"turns": settled["turns"], **{name: settled[name][k] for name in ("reading", "command", "current")}}
+        name = f"fit_{k:02d}.csv" if k < len(case.drives) else f"check_{k - len(case.drives):02d}.csv"
+        yield name, *record(one, drive, case.effects, case.instruments, rng)
 
 
 def write_case(case: Case, folder: Path):
-    """Recordings (fit_*.csv, check_*.csv) and bench.toml; returns nothing of the label."""
-    rng = np.random.default_rng(case.seed + 13)
+    """fit_*.csv, check_*.csv and bench.toml in `folder`; nothing of the label."""
     folder.mkdir(parents=True, exist_ok=True)
-    bench = ConcealedBench(case.truth, case.effects, case.density, case.start, np.random.default_rng(case.seed + 29))
-    rows, check = drives_of(case)
-    y, current = bench.run(rows + check)
-    for k, d in enumerate(rows + check):
-        count = y.shape[1]
-        time = np.arange(count) * (4 / d["frequency"] / count)
-        step = time[1]
-        slow = np.cumsum(rng.normal(size=count)) * np.sqrt(step) * 3e-8  # some red noise of the sensor, m per root of s
-        reading = y[k] + case.noise * rng.normal(size=count) + slow - slow.mean()
-        counts = 2e-4 / 2**16
-        reading = np.round(reading / counts) * counts
-        command = current[k] + 5e-4 * rng.normal(size=count)
-        name = f"fit_{k:02d}.csv" if k < len(rows) else f"check_{k - len(rows):02d}.csv"
-        header = "# current: command\ntime_s,current_A,displacement_m"
-        np.savetxt(folder / name, np.stack([time, command, reading], axis=1), delimiter=",", header=header, comments="", fmt="%.9g")
-    (folder / "bench.toml").write_text(BENCH)
+    kind = "measured" if case.instruments["readback"] else "command"
+    for name, time, current, displacement in recordings_of(case):
+        header = f"# current: {kind}\ntime_s,current_A,displacement_m"
+        np.savetxt(
+            folder / name, np.stack([time, current, displacement], axis=1), delimiter=",", header=header, comments="", fmt="%.10g"
+        )
+    c0 = 1.54e4 * (1.2 if case.instruments.get("fault") == "wrong_c0" else 1)
+    (folder / "bench.toml").write_text(BENCH.replace("C0", f"{c0:.6g}"))
 
 
-BENCH = """name = "concealed"
+BENCH = """name = "aa-050h of this trial"
 [coil]
 N_m = 1300
 A_m = 2.83e-5
-c0 = 1.54e4
+c0 = C0
 H_bias = 1.23e4
-R_eddy = 80.0
+R_eddy = 70.0
 [magnetostriction]
 M_s = 7.87e5
 lambda_s = 1.313e-3
 l_rod = 5.13e-2
 [mechanics]
-f0 = 400.0
-xi = 0.6
+f0 = 392.0
+xi = 0.7783
 [hysteresis]
 levels = 25
 [limits]
@@ -136,7 +198,33 @@ current_A = 1.0
 """
 
 
+def block_outside(case: Case) -> str:
+    """The block where physics outside the catalogue sits."""
+    return BLOCK_OF_OUTSIDE[next(iter(case.effects))]
+
+
 def seal(suite: str) -> str:
     """SHA-256 over all labels of a suite."""
-    text = json.dumps([make_case(suite, k).label() for k in range(SUITES[suite])], sort_keys=True)
+    text = json.dumps([make_case(suite, k).label() for k in range(size(suite))], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def main():
+    """Write the seals, or one case's recordings."""
+    p = argparse.ArgumentParser(description=__doc__)
+    sub = p.add_subparsers(dest="do", required=True)
+    sub.add_parser("seal")
+    w = sub.add_parser("write")
+    w.add_argument("suite", choices=list(SUITES))
+    w.add_argument("number", type=int)
+    w.add_argument("folder", type=Path)
+    options = p.parse_args()
+    if options.do == "seal":
+        SEALS.write_text(json.dumps({s: {"cases": size(s), "sha256": seal(s)} for s in SUITES}, indent=1) + "\n")
+        print(SEALS.read_text())
+    else:
+        write_case(make_case(options.suite, options.number), options.folder)
+
+
+if __name__ == "__main__":
+    main()

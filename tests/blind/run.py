@@ -1,54 +1,89 @@
-"""Run a suite through the command line: `python -m tests.blind.run dev --out results --workers 2` (resumable).
+"""Run a suite through the command line: `python -m tests.blind.run dev --out blind-results --workers 2`.
 
-One folder a case: recordings, the command's own results, and done.json with exit status and time. Labels stay outside.
+Resumable: a case with done.json is skipped; every case is a process of its own. One folder a case holds the command's results
+and done.json (exit status, seconds, peak memory); recordings are written, used and removed, for they follow from the case.
 """
 
 import argparse
 import concurrent.futures
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-from .cases import SUITES, make_case, seal, write_case
+from .cases import SEALS, SUITES, make_case, seal, size, write_case
 
 
-def run_case(suite, number, out):
-    """One case, skipped where it is done."""
+def run_case(suite: str, number: int, out: Path, limit: float = 1200.0) -> dict:
+    """done.json of one case, run where it is not there yet; `limit` seconds."""
     case = make_case(suite, number)
     folder = Path(out) / case.name
     done = folder / "done.json"
     if done.exists():
-        return case.name
+        return json.loads(done.read_text())
     shutil.rmtree(folder, ignore_errors=True)
     write_case(case, folder)
-    fit, check = sorted(folder.glob("fit_*.csv")), sorted(folder.glob("check_*.csv"))
-    command = [sys.executable, "-m", "magjax", "diagnose", *map(str, fit), "--bench", str(folder / "bench.toml"), "--check", *map(str, check), "--out", str(folder / "result"), "--quiet"]
+    ended = diagnose(folder, folder / "result", limit)
+    part = folder / "done.part"
+    part.write_text(json.dumps({"name": case.name, **ended}))
+    part.replace(done)
+    for path in folder.glob("*.csv"):
+        path.unlink()
+    return json.loads(done.read_text())
+
+
+def diagnose(folder: Path, result: Path, limit: float) -> dict:
+    """The command on a folder of recordings: exit status, seconds, peak memory of the children so far, last words."""
+    fit, check = sorted(map(str, folder.glob("fit_*.csv"))), sorted(map(str, folder.glob("check_*.csv")))
+    command = [sys.executable, "-m", "magjax", "diagnose", *fit, "--bench", str(folder / "bench.toml")]
+    command += ["--check", *check] if check else []
+    command += ["--json", "--quiet", "--out", str(result)]
+    environment = {
+        **os.environ,
+        "OPENBLAS_NUM_THREADS": "1",
+        "MPLBACKEND": "Agg",
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    }
     begin = time.time()
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
-    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
-    done.write_text(json.dumps({"status": ended.returncode, "seconds": time.time() - begin, "last": ended.stderr[-500:]}))
-    for path in fit + check:
-        path.unlink()  # they follow from the case
-    return case.name
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=limit)
+        status, words, spoken = ended.returncode, ended.stderr, ended.stdout
+    except subprocess.TimeoutExpired:
+        status, words, spoken = -1, f"stopped after {limit:g} s", ""
+    result.mkdir(parents=True, exist_ok=True)
+    (result / "stdout.json").write_text(spoken)
+    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
+    return {"status": status, "seconds": round(time.time() - begin, 1), "peak_MB_so_far": round(memory), "last": words[-400:]}
 
 
 def main():
-    """Parse and run."""
+    """Check the seal, run what is not done, one line a case."""
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("suite", choices=list(SUITES))
-    p.add_argument("--out", default="blind-results")
+    p.add_argument("--out", type=Path, default=Path("blind-results"))
     p.add_argument("--workers", type=int, default=1)
-    p.add_argument("--numbers", type=int, nargs="*")
+    p.add_argument("--numbers", type=int, nargs="*", help="only these cases")
+    p.add_argument("--until", type=float, default=float("inf"), help="start no case after this many seconds")
     options = p.parse_args()
-    print(f"{options.suite}: labels sealed as {seal(options.suite)}", flush=True)
-    numbers = options.numbers or range(SUITES[options.suite])
+    if json.loads(SEALS.read_text())[options.suite]["sha256"] != seal(options.suite):
+        sys.exit(f"the labels of {options.suite} are not the sealed ones of {SEALS.name}: a case was changed after the seal")
+    begin = time.time()
+    numbers = range(size(options.suite)) if options.numbers is None else options.numbers
+
+    def one(number):
+        return (
+            run_case(options.suite, number, options.out)
+            if time.time() - begin < options.until
+            else {"name": number, "status": "not started"}
+        )
+
     with concurrent.futures.ThreadPoolExecutor(options.workers) as pool:
-        for name in pool.map(lambda k: run_case(options.suite, k, options.out), numbers):
-            print(name, flush=True)
+        for ended in pool.map(one, numbers):
+            print(ended["name"], ended["status"], ended.get("seconds", ""), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,26 @@
-"""Score a suite: `python -m tests.blind.score dev --out results` prints the table in Markdown.
+"""Score a suite: `python -m tests.blind.score dev --out blind-results [--cases] [--table FILE]`, Markdown.
 
-A single counts as right if it is named alone, as grouped if the true name stands in the group; instruments' lags are
-one family where they are weak. Shares carry Wilson intervals of 95 %.
+Outcomes. right: exactly what is concealed is named, nothing else (nulls: silence; outside: unknown_at; data: data_problem or a
+refusal). group: the truth stands in a group and nothing foreign is named. kin: another member of the truth's known group is named
+alone. extra: the truth and something foreign. partly: one of two. silent: nothing is claimed. unknown: unknown_at. wrong: the rest.
+Shares carry Wilson intervals of 95 %.
 """
 
 import argparse
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-from .cases import SUITES, make_case
+from .cases import SUITES, block_outside, make_case, seal, size
+from .strengths import GROUPS
+
+ORDER = ("right", "group", "kin", "extra", "partly", "silent", "unknown", "data_problem", "wrong", "failed")
+QUIET = ("nothing_missing", "absorbed")
 
 
-def wilson(right, total, z=1.96):
+def wilson(right: int, total: int, z: float = 1.96):
     """(low, high) of a share."""
     if total == 0:
         return 0.0, 1.0
@@ -22,75 +29,166 @@ def wilson(right, total, z=1.96):
     return (centre - spread) / (1 + z * z / total), (centre + spread) / (1 + z * z / total)
 
 
-def judge(case, diagnosis) -> str:
-    """"right", "group", "partly", "silent", "wrong", "unknown", "data_problem"."""
+def kin(name: str) -> set:
+    """Everything that shares a known group with `name`."""
+    return {n for g in GROUPS if name in g for n in g} | {name}
+
+
+def judge(case, diagnosis, status=0) -> str:
+    """One of ORDER for a case's diagnosis (None where there is none)."""
+    if diagnosis is None:
+        if status == 3:
+            return "right" if case.kind == "data" else "data_problem"
+        return "failed"
     verdict = diagnosis["verdict"]
     named = {e["name"] for e in diagnosis["effects"]}
     grouped = {n for g in diagnosis["groups"] for n in g}
     truth = set(case.effects)
     if verdict == "data_problem":
-        return "data_problem"
+        return "right" if case.kind == "data" else "data_problem"
+    if case.kind == "data":
+        return "silent" if not named | grouped else "wrong"
     if case.kind == "outside":
-        return "right" if verdict == "unknown_at" else "silent" if verdict in ("nothing_missing", "absorbed") else "wrong"
-    if case.kind == "hidden":
-        return "right" if verdict in ("nothing_missing", "absorbed") or named == truth else "group" if truth <= named | grouped else "wrong"
-    if not truth:
-        return "right" if verdict in ("nothing_missing", "absorbed") else "wrong"
-    if verdict in ("nothing_missing", "absorbed"):
+        return "right" if verdict == "unknown_at" else "silent" if verdict in QUIET else "wrong"
+    if case.kind in ("null", "decoy"):
+        quiet = verdict in QUIET or bool(named | grouped) and named | grouped <= truth
+        return "right" if quiet else "unknown" if verdict == "unknown_at" else "wrong"
+    if case.kind == "hidden" and (verdict in QUIET or truth & set(diagnosis["absorbed"])):
+        return "right"
+    if verdict in QUIET:
         return "silent"
     if verdict == "unknown_at":
         return "unknown"
+    return _naming(truth, named, grouped, diagnosis["groups"])
+
+
+def _naming(truth, named, grouped, groups):
     if named == truth and not grouped:
         return "right"
     if truth <= named | grouped:
-        return "group" if len(named - truth) == 0 else "partly"
-    return "partly" if truth & (named | grouped) else "wrong"
+        foreign = (named - truth) or len(groups) + len(named) > len(truth)
+        return "extra" if foreign else "group"
+    if truth & (named | grouped):
+        return "partly"
+    return "kin" if len(truth) == 1 and named and named <= kin(next(iter(truth))) else "wrong"
 
 
-def read(suite, out):
-    """(case, diagnosis or None, seconds) of every case that is done."""
-    rows = []
-    for k in range(SUITES[suite]):
+def read(suite: str, out: Path):
+    """(case, diagnosis or None, done) of every case that is done."""
+    for k in range(size(suite)):
         case = make_case(suite, k)
         folder = Path(out) / case.name
-        if not (folder / "done.json").exists():
-            continue
-        done = json.loads((folder / "done.json").read_text())
-        path = folder / "result" / "diagnosis.json"
-        rows.append((case, json.loads(path.read_text()) if path.exists() else None, done))
-    return rows
+        if (folder / "done.json").exists():
+            path = folder / "result" / "diagnosis.json"
+            yield case, json.loads(path.read_text()) if path.exists() else None, json.loads((folder / "done.json").read_text())
+
+
+def gap_closed(diagnosis):
+    """Shares of the gap between the base's check error and the noise that the repair closed."""
+    for c in diagnosis["check"]:
+        gap = c["rms_before"] ** 2 - c["noise_rms"] ** 2
+        if c["rms_before"] > 1.5 * c["noise_rms"] > 0:
+            yield 1 - max(c["rms_after"] ** 2 - c["noise_rms"] ** 2, 0.0) / gap
+
+
+def coverage(case, diagnosis):
+    """Whether each 90 % interval of R_eddy, xi and f0 holds the truth."""
+    fitted = (diagnosis.get("repaired") or diagnosis.get("base") or {}).get("parameters", {})
+    for key in ("coil.R_eddy", "mechanics.xi", "mechanics.f0"):
+        p, true = fitted.get(key), case.truth[key.split(".")[1]]
+        if p and p.get("stderr"):
+            yield abs(p["value"] - true) <= 1.645 * p["stderr"]
+
+
+def table(suite: str, rows) -> str:
+    """The result table, the confusion matrix and the numbers beside them."""
+    by, closed, covered, seconds, blocks = {}, [], [], [], []
+    for case, diagnosis, done in rows:
+        outcome = judge(case, diagnosis, done["status"])
+        by.setdefault((case.kind, case.level if case.kind in ("single", "outside", "hidden") else ""), []).append(outcome)
+        seconds.append(done["seconds"])
+        if diagnosis and case.kind in ("single", "pair"):
+            closed += gap_closed(diagnosis)
+        if diagnosis and (case.kind == "null" or outcome == "right" and case.kind in ("single", "pair")):
+            covered += coverage(case, diagnosis)
+        if diagnosis and case.kind == "outside" and outcome == "right":
+            blocks.append((diagnosis["unknown"] or {}).get("block") == block_outside(case))
+    used = [o for o in ORDER if any(o in v for v in by.values())]
+    lines = [f"Suite {suite}: {len(rows)} of {size(suite)} cases run, labels {seal(suite)[:16]}.", ""]
+    lines += ["| concealed | cases | " + " | ".join(used) + " | right or group, 95 % |", "|---|" + "---|" * (len(used) + 2)]
+    rank = ("null", "decoy", "single", "pair", "outside", "hidden", "data")
+    for key in sorted(by, key=lambda k: (rank.index(k[0]), ("weak", "mid", "strong", "").index(k[1]))):
+        got = by[key]
+        good = sum(o in ("right", "group") for o in got)
+        low, high = wilson(good, len(got))
+        cells = " | ".join(str(got.count(o) or "") for o in used)
+        lines.append(f"| {' '.join(filter(None, key))} | {len(got)} | {cells} | {good}/{len(got)}: {low:.0%} to {high:.0%} |")
+    lines.append("")
+    if closed:
+        lines.append(f"Gap of the check error to the noise closed (power, median of {len(closed)}): {np.median(closed):.0%}.")
+    if covered:
+        low, high = wilson(sum(covered), len(covered))
+        lines.append(
+            f"90 % intervals of R_eddy, xi, f0 hold the truth in {np.mean(covered):.0%} ({low:.0%} to {high:.0%}, {len(covered)})."
+        )
+    if blocks:
+        lines.append(f"unknown_at names the right block in {sum(blocks)} of {len(blocks)}.")
+    lines.append(f"Time of one diagnosis, compilation included: median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s.")
+    return "\n".join(lines) + "\n\n" + confusion(rows)
+
+
+def confusion(rows) -> str:
+    """What was said for each single and outside effect, as a list: truth -> verdicts."""
+    said = {}
+    for case, diagnosis, done in rows:
+        if case.kind in ("single", "outside", "hidden"):
+            said.setdefault((case.kind, next(iter(case.effects))), Counter())[_spoken(diagnosis, done)] += 1
+    lines = ["| concealed | said (times) |", "|---|---|"]
+    for (kind, name), counter in sorted(said.items()):
+        said_as = ", ".join(f"{s} ({n})" for s, n in counter.most_common())
+        lines.append(f"| {name}{'' if kind == 'single' else f' ({kind})'} | {said_as} |")
+    return "\n".join(lines)
+
+
+def _spoken(diagnosis, done):
+    if diagnosis is None:
+        return f"exit {done['status']}"
+    parts = [e["name"] for e in diagnosis["effects"]] + ["{" + " ".join(g) + "}" for g in diagnosis["groups"]]
+    unknown = f"unknown_at {(diagnosis['unknown'] or {}).get('block')}"
+    return " + ".join(parts) or (unknown if diagnosis["verdict"] == "unknown_at" else diagnosis["verdict"])
 
 
 def main():
-    """Print the table and, with --cases, every case."""
+    """Print the table and, with --cases, every case; with --table also write it."""
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("suite", choices=list(SUITES))
-    p.add_argument("--out", default="blind-results")
+    p.add_argument("--out", type=Path, default=Path("blind-results"))
     p.add_argument("--cases", action="store_true")
+    p.add_argument("--table", type=Path)
     options = p.parse_args()
-    rows = read(options.suite, options.out)
-    table, seconds, checks = {}, [], []
-    for case, diagnosis, done in rows:
-        verdict = judge(case, diagnosis) if diagnosis else f"failed ({done['status']})"
-        key = case.kind if case.kind == "null" else f"{case.kind}, {case.strength}"
-        table.setdefault(key, []).append(verdict)
-        seconds.append(done["seconds"])
-        ratios = [c["rms_after"] / max(c["noise_rms"], 1e-12) for c in diagnosis["check"]] if diagnosis else []
-        before = [c["rms_before"] / max(c["noise_rms"], 1e-12) for c in diagnosis["check"]] if diagnosis else []
-        checks += ratios
-        if options.cases:
-            said = diagnosis and (diagnosis["verdict"], [e["name"] for e in diagnosis["effects"]], diagnosis["groups"])
-            chi = diagnosis and [round((diagnosis[k] or {}).get("chi2_per_sample", float("nan")), 2) for k in ("base", "repaired")]
-            print(case.name, case.kind, case.strength, case.density, case.start, case.effects, "->", verdict, said, chi, np.round(before, 1), np.round(ratios, 1), round(done["seconds"]))
-    outcomes = sorted({v for vs in table.values() for v in vs})
-    print(f"\n| {options.suite}: {len(rows)} cases | " + " | ".join(outcomes) + " | right or grouped, 95 % |")
-    print("|---|" + "---|" * (len(outcomes) + 1))
-    for key, verdicts in sorted(table.items()):
-        good = sum(v in ("right", "group") for v in verdicts)
-        low, high = wilson(good, len(verdicts))
-        print(f"| {key} | " + " | ".join(str(verdicts.count(o)) for o in outcomes) + f" | {good}/{len(verdicts)}: {low:.0%}-{high:.0%} |")
-    if checks:
-        print(f"\nCheck error over noise: median {np.median(checks):.2f}, 90th percentile {np.quantile(checks, 0.9):.2f}; median time {np.median(seconds):.0f} s.")
+    rows = list(read(options.suite, options.out))
+    if not rows:
+        raise SystemExit(
+            f"no finished case of {options.suite} in {options.out}: run python -m tests.blind.run {options.suite} first"
+        )
+    for case, diagnosis, done in rows if options.cases else ():
+        chi = [round((diagnosis[k] or {}).get("chi2_per_sample") or np.nan, 2) for k in ("base", "repaired")] if diagnosis else ""
+        ratio = [round(c["rms_after"] / max(c["noise_rms"], 1e-12), 2) for c in diagnosis["check"]] if diagnosis else ""
+        words = (
+            case.name,
+            case.kind,
+            case.level,
+            case.effects,
+            case.density,
+            case.start,
+            "->",
+            judge(case, diagnosis, done["status"]),
+        )
+        print(*words, "|", _spoken(diagnosis, done), chi, ratio, done["seconds"], "s", flush=True)
+    text = table(options.suite, rows)
+    print(text)
+    if options.table:
+        options.table.write_text(text + "\n")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,147 @@
+"""The blind proof's own tests: it shares no code with what it tests, its numerics hold, its labels are the sealed ones."""
+
+import ast
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.blind.cases import SEALS, SUITES, make_case, plan, recordings_of, seal, size, write_case
+from tests.blind.generator.bench import ConcealedBench
+from tests.blind.generator.coil import shell_matrix
+from tests.blind.generator.density import KINDS, SPAN, PlayDensity
+from tests.blind.generator.instruments import record
+from tests.blind.generator.strain import settled_play
+from tests.blind.score import judge, wilson
+from tests.blind.strengths import GROUPS, HIDDEN, OUTSIDE, VISIBLE
+
+FOLDER = Path(__file__).parent / "blind"
+TRUTH = {"R_eddy": 70.0, "f0": 392.0, "xi": 0.78, "H_bias": 1.23e4}
+DRIVES = [{"frequency": f, "amplitude": a, "offset": 0.05} for f, a in ((10.0, 0.8), (120.0, 0.4), (300.0, 0.8))]
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module or ""
+
+
+def test_generator_shares_no_code():
+    paths = list(FOLDER.rglob("*.py"))
+    assert len(paths) > 10
+    for path in paths:
+        roots = {m.split(".")[0] for m in imported(path)}
+        assert not roots & {"magjax", "fitting", "jax", "equinox", "optimistix", "importlib"}, path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_settled_and_converged(kind):
+    bench = ConcealedBench(TRUTH, {}, kind, "demagnetized", np.random.default_rng(3))
+    y = bench.run(DRIVES, steps=500, settle=4)["reading"]
+    assert np.abs(bench.run(DRIVES, steps=1000, settle=5)["reading"][:, ::2] - y).max() < 8e-9  # cases run at 1000: a quarter
+    assert 1e-5 < np.ptp(y) < 7e-5
+
+
+@pytest.mark.parametrize(
+    "name", ["excess_loss", "field_diffusion", "magnetic_aftereffect", "coulomb_friction", "duffing_stiffness"]
+)
+def test_effects_settle(name):
+    bench = ConcealedBench(TRUTH, {name: VISIBLE[name][2]}, "heavy", "negative", np.random.default_rng(3))
+    first, second = (bench.run(DRIVES[1:], steps=500, settle=s)["reading"] for s in (6, 9))
+    assert np.abs(first - second).max() < 2e-9
+
+
+@pytest.mark.parametrize("name", sorted({**VISIBLE, **HIDDEN, **OUTSIDE}))
+def test_every_effect_acts_and_grows(name):
+    bench = ConcealedBench(TRUTH, {}, "gauss", "demagnetized", np.random.default_rng(5))
+    instruments = {"samples": 250, "rate": 0.0, "noise": 0.0, "pink": 0.0, "bits": 24, "readback": 0.0}
+
+    def reading(effects):
+        bench.effects = effects
+        settled = bench.run(DRIVES[::2], steps=250, settle=1)
+        rng = np.random.default_rng(9)
+        rows = [{k: v[n] if np.ndim(v) else v for k, v in settled.items()} for n in range(2)]
+        return np.concatenate([record(r, d, effects, instruments, rng)[2] for r, d in zip(rows, DRIVES[::2], strict=True)])
+
+    base = reading({})
+    weak, strong = ({**VISIBLE, **HIDDEN, **OUTSIDE}[name][k] for k in (0, 2))
+    low, high = (np.sqrt(np.mean((reading({name: s}) - base) ** 2)) for s in (weak, strong))
+    assert 3e-9 < low < high < 1e-5
+
+
+def test_static_limit_is_the_preisach_integral():
+    density = PlayDensity("gauss", 7e5, np.random.default_rng(0), radii=60)
+    plays, M, _ = density.evaluate(density.start((1,), "negative"), np.array([SPAN]))
+    assert abs(M[0] - 7e5) < 1e-3 * 7e5
+    path = np.array([2e4, -1e4, 1.5e4, -5e3, 1e4])
+    relays_s = np.linspace(-SPAN, SPAN, 2401)[:-1] + SPAN / 2400
+    state = np.ones((60, 2400))
+    plays = density.start((1,), "positive")
+    for H in path:  # relays switched one by one
+        state[relays_s[None] + density.radii[:, None] <= H] = 1
+        state[relays_s[None] - density.radii[:, None] >= H] = -1
+        plays, M, _ = density.evaluate(plays, np.array([H]))
+        assert abs((state.ravel() * density.slope).sum() * 0.5 * density.step - M[0]) < 3e-3 * 7e5
+
+
+def test_memory_wipes_out():
+    density = PlayDensity("rough", 7e5, np.random.default_rng(0))
+    plays = density.start((2,), "demagnetized")
+    for H in ((2e4, 2e4), (-2e4, -2e4), (5e3, 8e3), (0.0, -3e3), (2.1e4, 2.1e4)):
+        plays, M, _ = density.evaluate(plays, np.array(H))
+    assert M[0] == M[1]
+
+
+def test_shells_hold_the_lag_of_a_thin_cylinder():
+    K = shell_matrix(8)
+    assert np.allclose(K, K.T) and abs(K.mean() - 1) < 1e-12 and np.linalg.eigvalsh(K).min() > 0
+    exact = (1 - (np.arange(8) + 0.5) / 8) / 0.5  # H_app - H(r) of a uniform dB/dt falls as 1 - r^2
+    assert np.allclose(K.mean(axis=1), exact, atol=0.02)
+
+
+def test_play_of_a_sine():
+    x = np.sin(2 * np.pi * np.arange(400) / 400)[None]
+    assert abs(settled_play(x, 0.2).max() - 0.8) < 1e-12 and abs(settled_play(x, 0.2).min() + 0.8) < 1e-12
+
+
+def test_suites_hold_what_they_promise():
+    kinds = [row[0] for row in plan("test")]
+    assert size("test") >= 150 and kinds.count("null") + kinds.count("decoy") >= 40
+    assert {n for k, names, _ in plan("test") if k == "single" for n in names} == set(VISIBLE)
+    assert not set(VISIBLE) & set(HIDDEN) and {n for g in GROUPS for n in g} <= {**VISIBLE, **HIDDEN}.keys()
+
+
+@pytest.mark.parametrize("suite", list(SUITES))
+def test_labels_are_the_sealed_ones(suite):
+    assert json.loads(SEALS.read_text())[suite] == {"cases": size(suite), "sha256": seal(suite)}
+
+
+def test_recordings_follow_from_the_case_and_keep_the_contract(tmp_path):
+    case = next(
+        make_case("dev", k)
+        for k in range(size("dev"))
+        if plan("dev")[k][0] == "null" and not make_case("dev", k).instruments["rate"]
+    )
+    write_case(case, tmp_path)
+    files = sorted(p.name for p in tmp_path.glob("*.csv"))
+    assert files == [f"check_{k:02d}.csv" for k in range(3)] + [f"fit_{k:02d}.csv" for k in range(9)]
+    lines = (tmp_path / "fit_00.csv").read_text().splitlines()
+    assert lines[0].startswith("# current:") and lines[1] == "time_s,current_A,displacement_m" and len(lines) == 4002
+    again = next(iter(recordings_of(case)))
+    assert np.allclose(np.loadtxt(tmp_path / "fit_00.csv", delimiter=",", skiprows=2).T, again[1:], rtol=1e-9, atol=1e-12)
+
+
+def test_scorer():
+    case = next(make_case("dev", k) for k in range(size("dev")) if plan("dev")[k][0] == "single")
+    name = next(iter(case.effects))
+    said = {"verdict": "attributed", "effects": [{"name": name}], "groups": [], "absorbed": []}
+    assert judge(case, said) == "right"
+    assert judge(case, {**said, "effects": [{"name": name}, {"name": "linear_strain"}]}) == "extra"
+    assert judge(case, {**said, "verdict": "group", "effects": [], "groups": [[name, "linear_strain"]]}) == "group"
+    assert judge(case, {**said, "verdict": "nothing_missing", "effects": []}) == "silent"
+    assert judge(case, None, 3) == "data_problem" and judge(case, None, 1) == "failed"
+    low, high = wilson(40, 40)
+    assert 0.91 < low < 0.92 and high > 0.999
