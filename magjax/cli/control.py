@@ -38,7 +38,9 @@ def run_invert(arguments) -> int:
     p.add_argument("--bench", help="bench file (TOML) or a built-in name")
     p.add_argument("--model", help="a fitted result folder")
     p.add_argument("--out", default="current.csv", help="CSV to write: time_s, current_A")
-    p.add_argument("--of-reading", action="store_true", help="the trajectory is that of the sensor's reading: undo its lag and delay too")
+    p.add_argument(
+        "--of-reading", action="store_true", help="the trajectory is that of the sensor's reading: undo its lag and delay too"
+    )
     options = p.parse_args(arguments)
     from magjax.inverse.command import invert_file
 
@@ -65,7 +67,11 @@ def _common(name, text, example):
 
 def run_design(arguments) -> int:
     """magjax control design."""
-    p = _common("design", "The l1-optimal controller of T&B Sec. 4.2 for the rod of a bench or a fitted model.", "magjax control design --u-bar 3.25 --out design")
+    p = _common(
+        "design",
+        "The l1-optimal controller of T&B Sec. 4.2 for the rod of a bench or a fitted model.",
+        "magjax control design --u-bar 3.25 --out design",
+    )
     p.add_argument("--r-bar", type=float, default=30.0, help="largest reference, um (default 30)")
     p.add_argument("--w-bar", type=float, default=0.1, help="largest inversion error, M_s^2 (default 0.1)")
     p.add_argument("--c-w", type=float, default=6.53e-13, help="size of the model's uncertainty, um per (A/m)^2 (default 6.53e-13)")
@@ -83,7 +89,11 @@ def run_design(arguments) -> int:
 
 def run_bounds(arguments) -> int:
     """magjax control bounds."""
-    p = _common("bounds", "Bounds of the inversion's error, T&B Props. 4.1-4.3, and a simulated worst case.", "magjax control bounds --delta-I 0.05 --T 5e-4")
+    p = _common(
+        "bounds",
+        "Bounds of the inversion's error, T&B Props. 4.1-4.3, and a simulated worst case.",
+        "magjax control bounds --delta-I 0.05 --T 5e-4",
+    )
     p.add_argument("--delta-I", type=float, default=0.05, help="relative error of the Preisach masses (default 0.05)")
     options = p.parse_args(arguments)
     from magjax.control.command import bounds_summary
@@ -95,9 +105,17 @@ def run_bounds(arguments) -> int:
 
 def run_simulate(arguments) -> int:
     """magjax control simulate."""
-    p = _common("simulate", "One tracking strategy on the actuator, integrated event by event.", "magjax control simulate --strategy l1 --out track.csv")
-    p.add_argument("--strategy", default="dynamic_inverse", help="proportional, static_inverse, dynamic_inverse, l1, l1_over_relaxed")
-    p.add_argument("--trajectory", default="sine", help="sine (20 Hz), aperiodic (round 30 Hz), or a CSV with time_s and displacement_m")
+    p = _common(
+        "simulate",
+        "One tracking strategy on the actuator, integrated event by event.",
+        "magjax control simulate --strategy l1 --out track.csv",
+    )
+    p.add_argument(
+        "--strategy", default="dynamic_inverse", help="proportional, static_inverse, dynamic_inverse, l1, l1_over_relaxed"
+    )
+    p.add_argument(
+        "--trajectory", default="sine", help="sine (20 Hz), aperiodic (round 30 Hz), or a CSV with time_s and displacement_m"
+    )
     p.add_argument("--out", default="track.csv", help="CSV to write")
     options = p.parse_args(arguments)
     from magjax.control.command import simulate_summary
@@ -109,9 +127,14 @@ def run_simulate(arguments) -> int:
 
 def run_compare(arguments) -> int:
     """magjax control compare."""
-    p = _common("compare", "Every strategy on the nominal plant, with fit errors, and with concealed physics before and after its repair.",
+    p = _common("compare", "Every strategy: nominal plant, fit errors, noise, and a concealed bench before and after its repair.",
                 "magjax control compare --hide amplifier_lag --out study")  # fmt: skip
-    p.add_argument("--hide", default="amplifier_lag", choices=("amplifier_lag", "quartic_magnetostriction", "none"), help="what to conceal (default amplifier_lag)")
+    p.add_argument(
+        "--hide",
+        default="amplifier_lag",
+        choices=("amplifier_lag", "quartic_magnetostriction", "none"),
+        help="what to conceal (default amplifier_lag)",
+    )
     p.add_argument("--out", help="folder for study.json and the figure")
     options = p.parse_args(arguments)
     folder = output_folder(options.out)

@@ -15,7 +15,12 @@ from .tracking import STRATEGIES, aperiodic, compare, perturbed, sinusoid, track
 
 def _problem(plant, options, **changed):
     stroke = 1e6 * plant.l_rod * plant.lambda_s
-    stated = {"r_bar": getattr(options, "r_bar", 30.0), "w_bar": getattr(options, "w_bar", 0.1), "u_bar": options.u_bar, "T": options.T}
+    stated = {
+        "r_bar": getattr(options, "r_bar", 30.0),
+        "w_bar": getattr(options, "w_bar", 0.1),
+        "u_bar": options.u_bar,
+        "T": options.T,
+    }
     c_w = changed.pop("c_w", getattr(options, "c_w", 6.53e-13))
     return TrackingProblem(plant=rod(plant.f0, plant.xi, options.T, stroke), weight=weight(c_w * M_S**2), **{**stated, **changed})
 
@@ -29,15 +34,20 @@ def design_summary(plant, options, folder) -> dict:
     summary = {
         "gamma_um": made.gamma, "lower_um": made.lower, "gap": made.gap, "norms": made.norms, "order": controller.order,
         "reduced_gamma_um": controller.gamma, "hard_rows_broken": controller.breaks(), "margins": dataclasses.asdict(margins),
-        "Q": [float(q) for q in made.Q], "K": {k: np.asarray(getattr(K, k)).tolist() for k in "ABCD"}, "T": options.T, "seconds": made.seconds,
+        "Q": [float(q) for q in made.Q], "K": {k: np.asarray(getattr(K, k)).tolist() for k in "ABCD"},
+        "T": options.T, "seconds": made.seconds,
     }  # fmt: skip
     poles = np.abs(np.linalg.eigvals(np.asarray(K.A)))
-    warning = " K itself has poles on the unit circle: it winds up; keep its anti-windup or lower u_bar." if len(poles) and poles.max() > 1 - 1e-4 else ""
+    warning = (
+        " K itself has poles on the unit circle: it winds up; keep its anti-windup or lower u_bar."
+        if len(poles) and poles.max() > 1 - 1e-4
+        else ""
+    )
     if margins.delay == 0:
         warning += " One extra sample of delay destabilizes the loop."
     summary["message"] = (
-        f"gamma* = {made.gamma:.6g} um (certified within {made.gap:.1e}); control at most {made.control:.4g} M_s^2; controller of order "
-        f"{controller.order} on its model; {margins}.{warning}"
+        f"gamma* = {made.gamma:.6g} um (certified within {made.gap:.1e}); control at most {made.control:.4g} M_s^2; controller of "
+        f"order {controller.order} on its model; {margins}.{warning}"
     )
     if folder is not None:
         (folder / "design.json").write_text(json.dumps(summary, indent=1))
@@ -62,8 +72,18 @@ def design_figures(plant, options, folder) -> Path:
     w_bars = np.linspace(0.02, 0.3, 12)
     u_bars = np.concatenate([np.linspace(0.25, 4.0, 12), np.linspace(4.25, 7.5, 6)])
     curves = [
-        (c_ws, [design(_problem(plant, options, c_w=c, u_bar=7.5), 40).gamma for c in c_ws], "c_w, um per (A/m)$^2$", "Fig. 13: model uncertainty"),
-        (w_bars, [design(_problem(plant, options, w_bar=w, u_bar=1.25), 40).gamma for w in w_bars], "w_bar, $M_s^2$", "Fig. 14: inversion error"),
+        (
+            c_ws,
+            [design(_problem(plant, options, c_w=c, u_bar=7.5), 40).gamma for c in c_ws],
+            "c_w, um per (A/m)$^2$",
+            "Fig. 13: model uncertainty",
+        ),
+        (
+            w_bars,
+            [design(_problem(plant, options, w_bar=w, u_bar=1.25), 40).gamma for w in w_bars],
+            "w_bar, $M_s^2$",
+            "Fig. 14: inversion error",
+        ),
         (u_bars, [design(_problem(plant, options, u_bar=u), 40).gamma for u in u_bars], "u_bar, $M_s^2$", "Fig. 15: saturation"),
     ]
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
@@ -78,7 +98,10 @@ def design_figures(plant, options, folder) -> Path:
         axes[2].legend(fontsize=8)
     except ConfigurationError:  # no closed form where the sampled rod is not minimum phase
         axes[2].set_title("Fig. 15: saturation (no closed-form knee)")
-    figure.suptitle(f"l1 designs with the printed constants and an assumed hold at T = {options.T * 1e3:g} ms (the paper does not state T)", fontsize=10)
+    figure.suptitle(
+        f"l1 designs with the printed constants and an assumed hold at T = {options.T * 1e3:g} ms (the paper does not state T)",
+        fontsize=10,
+    )
     path = folder / "l1_figures.png"
     figure.savefig(path, dpi=130)
     plt.close(figure)
@@ -101,7 +124,8 @@ def simulate_summary(plant, options) -> dict:
         np.savetxt(out, table, delimiter=",", header="time_s,wanted_m,reached_m,current_A", comments="", fmt="%.10g")
     except OSError as error:
         raise ConfigurationError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-    text = f"{options.strategy}: rms error {rms * 1e6:.3g} um, largest {largest * 1e6:.3g} um, {run.saturated:.0%} of the samples at a limit; wrote {out}"
+    text = f"{options.strategy}: rms error {rms * 1e6:.3g} um, largest {largest * 1e6:.3g} um, "
+    text += f"{run.saturated:.0%} of the samples at a limit; wrote {out}"
     return {"rms_m": rms, "largest_m": largest, "saturated": run.saturated, "file": str(out), "message": text}
 
 
@@ -112,7 +136,11 @@ NOISE_M = 2e-7  # of the reading in the table's noisy rows
 def compare_summary(plant, options, folder, benches=None) -> dict:
     """The tracking table. `benches()`: models before and after a diagnosis, the plant itself, and what was found."""
     wrong = perturbed(plant, seed=options.seed)
-    plants = {"nominal": (plant, plant), "fit errors": (plant, wrong), f"fit errors, {NOISE_M * 1e6:g} um noise": (plant, wrong, NOISE_M)}
+    plants = {
+        "nominal": (plant, plant),
+        "fit errors": (plant, wrong),
+        f"fit errors, {NOISE_M * 1e6:g} um noise": (plant, wrong, NOISE_M),
+    }
     found = {}
     if benches is not None:
         before, after, true, found = benches()
@@ -141,24 +169,25 @@ def _tracking_figure(plants, options, folder):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    shown = ("proportional", "static_inverse", "dynamic_inverse", "l1")
-    figure, axes = plt.subplots(2, len(shown), figsize=(13, 5.6), sharex=True, layout="constrained", height_ratios=(2, 1))
-    name, (plant, model, *_) = next(iter(plants.items()))
-    time, wanted = sinusoid(plant, options.T)
-    for column, strategy in enumerate(shown):
+    shown = [(strategy, "nominal") for strategy in STRATEGIES[:4]] + [(STRATEGIES[4], "fit errors")]
+    figure, axes = plt.subplots(3, len(shown), figsize=(16, 7), sharex=True, layout="constrained", height_ratios=(2, 1, 1))
+    for column, (strategy, name) in enumerate(shown):
+        plant, model, *_ = plants[name]
+        time, wanted = sinusoid(plant, options.T)
         run = track(plant, model, time, wanted, strategy, options.u_bar)
         axes[0, column].plot(time, wanted * 1e6, color="0.6", lw=2, label="wanted")
         axes[0, column].plot(time, run.reached * 1e6, color="#1f5c99", lw=1, label="reached")
-        axes[0, column].set_title(strategy.replace("_", " "))
+        axes[0, column].set_title(strategy.replace("_", " ") + ("" if name == "nominal" else f" ({name})"))
         axes[1, column].plot(time, (run.reached - wanted) * 1e6, color="#b03a2e", lw=0.8)
-        axes[1, column].set_xlabel("time, s")
+        axes[2, column].step(time, run.current, color="#2e7d32", lw=0.8, where="post")
+        axes[2, column].set_xlabel("time, s")
         for ax in axes[:, column]:
             ax.grid(alpha=0.3)
-    axes[0, 0].set_ylabel("displacement, um")
-    axes[1, 0].set_ylabel("error, um")
+    for row, label in enumerate(("displacement, um", "error, um", "current, A")):
+        axes[row, 0].set_ylabel(label)
     axes[0, 0].legend(fontsize=8)
-    figure.suptitle(f"Tracking 20 Hz on the {name} plant (compare T&B Figs. 10 and 16)", fontsize=10)
-    figure.savefig(folder / "tracking.png", dpi=120)
+    figure.suptitle("Tracking 20 Hz (compare T&B Figs. 10, 16 and 19)", fontsize=10)
+    figure.savefig(folder / "tracking.png", dpi=100)
     plt.close(figure)
 
 
@@ -169,7 +198,10 @@ def bounds_summary(plant, options) -> dict:
     lines, summary = [], {}
     static = static_bound(plant, delta_I=options.delta_I)
     summary["4.1"] = {"bound_A_per_m": static.value, "share_of_M_s": static.share, "note": static.note}
-    lines.append(f"Prop. 4.1, masses off by {options.delta_I:g}: |e_M| <= {static.value:.4g} A/m ({static.share:.3g} of the summed masses) {static.note}")
+    lines.append(
+        f"Prop. 4.1, masses off by {options.delta_I:g}: |e_M| <= {static.value:.4g} A/m "
+        f"({static.share:.3g} of the summed masses) {static.note}"
+    )
     for name, maker, forward in (("4.2", forward_bound, True), ("4.3", backward_bound, False)):
         try:
             bound = maker(plant, options.T)
@@ -180,9 +212,16 @@ def bounds_summary(plant, options) -> dict:
             lines.append(f"Prop. {name}: {error}")
             continue
         worst = simulated_worst(plant, options.T, bound.g_bar, forward, seed=options.seed)
-        summary[name] = {"bound_A_per_m": bound.value, "share_of_M_s": bound.share, "g_bar": bound.g_bar, "simulated_A_per_m": worst, "note": bound.note}
+        summary[name] = {
+            "bound_A_per_m": bound.value,
+            "share_of_M_s": bound.share,
+            "g_bar": bound.g_bar,
+            "simulated_A_per_m": worst,
+            "note": bound.note,
+        }
         lines.append(
-            f"Prop. {name}, T = {options.T:g} s: |e_M| <= {bound.value:.4g} A/m ({bound.share:.3g} of the summed masses) at g_bar = {bound.g_bar:.3g}; "
+            f"Prop. {name}, T = {options.T:g} s: |e_M| <= {bound.value:.4g} A/m ({bound.share:.3g} of the summed masses) "
+            f"at g_bar = {bound.g_bar:.3g}; "
             f"simulated worst {worst:.4g} A/m ({worst / plant.operator.total:.3g} of them) {bound.note}"
         )
     summary["message"] = "\n".join(line.rstrip() for line in lines)

@@ -21,7 +21,8 @@ MOST_TAIL = 4000
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """A certified design. `Q`: taps; `gamma`, `lower`: bounds of gamma*, um (`lower` is NaN for an unstable plant, where it is not certified); `norms`: l1 norms re-evaluated from Q:
+    """A certified design. `Q`: taps; `gamma`, `lower`: bounds of gamma*, um (`lower` is NaN for an unstable plant, where it
+    is not certified); `norms`: l1 norms re-evaluated from Q:
     error_r, error_w (um), control_r, control_w (M_s^2), robust; `seconds`: of the programmes."""
 
     problem: TrackingProblem
@@ -186,6 +187,8 @@ def design(problem: TrackingProblem = None, taps: int = 40) -> Design:
     from .lower import lower_bound
 
     problem = TrackingProblem() if problem is None else problem
+    if taps < 4:
+        raise ConfigurationError(f"taps = {taps}; give 4 or more (40 suffice for the problem of T&B)")
     begin = time.perf_counter()
     full = Channels(problem, taps, taps + _tail(problem))
     for slack in (BACK_OFF, 4 * BACK_OFF, 16 * BACK_OFF):
@@ -211,7 +214,8 @@ def _refuse(channels, problem):
     least, _ = programme(channels, np.inf, 0.0, minimum_control=True)
     if least.status == 0:
         raise ConfigurationError(
-            f"u_bar = {problem.u_bar:.6g} M_s^2 cannot be kept by any stabilizing controller; the smallest feasible u_bar is {least.fun * (1 + 1e-6):.6g}"
+            f"u_bar = {problem.u_bar:.6g} M_s^2 cannot be kept by any stabilizing controller; "
+            f"the smallest feasible u_bar is {least.fun * (1 + 1e-6):.6g}"
         )
     raise ConfigurationError("robust stability cannot be reached for this plant and weight; lower c_w (the model's uncertainty)")
 

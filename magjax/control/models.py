@@ -41,7 +41,15 @@ def actuator_system(plant: PlainActuator, T: float, current: float = 0.0):
     def output(t, x, u, params):
         return np.array([actuator.displacement - actuator.rod[0] + x[0]])
 
-    system = control.nlsys(update, output, inputs=["current_A"], outputs=["displacement_m"], states=["displacement_m", "speed_m_per_s"], dt=T, name="actuator")
+    system = control.nlsys(
+        update,
+        output,
+        inputs=["current_A"],
+        outputs=["displacement_m"],
+        states=["displacement_m", "speed_m_per_s"],
+        dt=T,
+        name="actuator",
+    )
     system.reset = actuator.reset
     system.actuator = actuator
     return system
@@ -52,7 +60,9 @@ def controller_system(controller, limit: float = np.inf, anti_windup: bool = Tru
     import control
 
     if controller.direct is not None:
-        raise ConfigurationError("the controller of an unstable plant has no internal model to saturate; take Controller.to_control()")
+        raise ConfigurationError(
+            "the controller of an unstable plant has no internal model to saturate; take Controller.to_control()"
+        )
     (Aq, Bq, Cq, Dq), (Am, Bm, Cm, _) = controller.Q, controller.model
     n = len(Aq)
 
@@ -68,7 +78,9 @@ def controller_system(controller, limit: float = np.inf, anti_windup: bool = Tru
     def output(t, x, u, params):
         return np.array([control_of(x, u)[2]])
 
-    return control.nlsys(update, output, inputs=["error_um"], outputs=["control_Ms2"], states=n + len(Am), dt=controller.problem.T, name="K")
+    return control.nlsys(
+        update, output, inputs=["error_um"], outputs=["control_Ms2"], states=n + len(Am), dt=controller.problem.T, name="K"
+    )
 
 
 def inverse_system(model: PlainActuator, T: float, middle: float = 0.5, limit: float = 2.0):
@@ -94,7 +106,9 @@ def inverse_system(model: PlainActuator, T: float, middle: float = 0.5, limit: f
     def output(t, x, u, params):
         return np.array([current(u, operator.copy())])
 
-    system = control.nlsys(update, output, inputs=["control_Ms2"], outputs=["current_A"], states=["field_A_per_m"], dt=T, name="inverse")
+    system = control.nlsys(
+        update, output, inputs=["control_Ms2"], outputs=["current_A"], states=["field_A_per_m"], dt=T, name="inverse"
+    )
     system.start = [operator.field]
     return system
 
@@ -112,9 +126,15 @@ def tracking_loop(controller, plant: PlainActuator, model: PlainActuator, limit:
     current = (inverse.start[0] - model.H_bias) / model.c0
     actuator = actuator_system(plant, T, current)
     K = controller_system(controller, limit, anti_windup)
-    comparison = control.ss([], [], [], [[1.0, -1e6]], dt=T, inputs=["reference_um", "displacement_m"], outputs=["error_um"], name="comparison")
+    comparison = control.ss(
+        [], [], [], [[1.0, -1e6]], dt=T, inputs=["reference_um", "displacement_m"], outputs=["error_um"], name="comparison"
+    )
     loop = control.interconnect(
-        [comparison, K, inverse, actuator], inputs=["reference_um"], outputs=["displacement_m", "control_Ms2", "current_A"], name="tracking", dt=T
+        [comparison, K, inverse, actuator],
+        inputs=["reference_um"],
+        outputs=["displacement_m", "control_Ms2", "current_A"],
+        name="tracking",
+        dt=T,
     )
     loop.start = np.concatenate([np.zeros(K.nstates), inverse.start, actuator.actuator.rod])
     return loop
@@ -131,15 +151,28 @@ def closed_loop(controller):
 
     K = controller.to_control()
     delay = control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], dt, inputs=["control_Ms2"], outputs=["u_Ms2"], name="inversion")
-    plant = control.ss(*state_space(np.append(0.0, n), np.convolve(d_s, d_u)), dt, inputs=["u_tilde"], outputs=["y0_um"], name="rod")
+    plant = control.ss(
+        *state_space(np.append(0.0, n), np.convolve(d_s, d_u)), dt, inputs=["u_tilde"], outputs=["y0_um"], name="rod"
+    )
     W = control.ss(*state_space(*problem.weight), dt, inputs=["u_tilde"], outputs=["z_um"], name="W0")
-    two = control.ss([[0.0, 0.0], [1.0, 0.0]], [[1.0], [0.0]], [[0.0, 1.0]], [[0.0]], dt, inputs=["reference_um"], outputs=["late_um"], name="two_delays")
+    two = control.ss(
+        [[0.0, 0.0], [1.0, 0.0]],
+        [[1.0], [0.0]],
+        [[0.0, 1.0]],
+        [[0.0]],
+        dt,
+        inputs=["reference_um"],
+        outputs=["late_um"],
+        name="two_delays",
+    )
     add_noise = control.summing_junction(inputs=["u_Ms2", "noise_Ms2"], output="u_tilde", name="noise")
     add_v = control.summing_junction(inputs=["y0_um", "v_um"], output="y_um", name="uncertainty")
     error = control.summing_junction(inputs=["reference_um", "-y_um"], output="error_um", name="comparison")
     tracking = control.summing_junction(inputs=["late_um", "-y_um"], output="tracking_um", name="tracking")
     systems = [K, delay, plant, W, two, add_noise, add_v, error, tracking]
-    return control.interconnect(systems, inputs=["reference_um", "noise_Ms2", "v_um"], outputs=["tracking_um", "u_Ms2", "z_um"], name="loop", dt=dt)
+    return control.interconnect(
+        systems, inputs=["reference_um", "noise_Ms2", "v_um"], outputs=["tracking_um", "u_Ms2", "z_um"], name="loop", dt=dt
+    )
 
 
 def rebuilt_norms(controller, count: int = 600) -> dict:

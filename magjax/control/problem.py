@@ -33,6 +33,8 @@ def roots_of(polynomial) -> np.ndarray:
 
 def weight(c_w: float = C_W_UM):
     """W_0 = 1.1759 c_w (lambda - 1.0005)/(lambda - 1.1765) of T&B Sec. 4.3: (numerator, denominator)."""
+    if not 0 <= c_w < np.inf:
+        raise ConfigurationError(f"c_w = {c_w}; give the size of the uncertainty, zero or more")
     return 1.1759 * c_w * np.array([-1.0005, 1.0]), np.array([-1.1765, 1.0])
 
 
@@ -81,15 +83,22 @@ class TrackingProblem:
         """
         n, d = (np.asarray(p, float) for p in self.plant)
         if d[0] == 0:
-            raise ConfigurationError("the plant's denominator has no constant term in lambda: it is not causal; divide out the delay")
+            raise ConfigurationError(
+                "the plant's denominator has no constant term in lambda: it is not causal; divide out the delay"
+            )
         poles = roots_of(d)
         if np.any(np.abs(np.abs(poles) - 1) < 1e-9):
-            raise ConfigurationError(f"the plant has a pole on the unit circle ({poles[np.argmin(np.abs(np.abs(poles) - 1))]:.6g}); no stabilizing factorization: add damping")
+            raise ConfigurationError(
+                f"the plant has a pole on the unit circle ({poles[np.argmin(np.abs(np.abs(poles) - 1))]:.6g}); "
+                "no stabilizing factorization: add damping"
+            )
         unstable = poles[np.abs(poles) < 1]
         zeros = roots_of(n) if len(np.trim_zeros(n)) > 1 else np.array([])
         for p in unstable:
             if abs(p) < 1e-12 or (len(zeros) and np.abs(zeros - p).min() < 1e-9):
-                raise ConfigurationError(f"the unstable pole at lambda = {p:.6g} is cancelled by a zero: no controller can stabilize this plant")
+                raise ConfigurationError(
+                    f"the unstable pole at lambda = {p:.6g} is cancelled by a zero: no controller can stabilize this plant"
+                )
         d_unstable = np.real(np.poly(1 / unstable)) if len(unstable) else np.array([1.0])
         d_stable, rest = np.polynomial.polynomial.polydiv(d, d_unstable)
         if np.abs(rest).max(initial=0.0) > 1e-8 * np.abs(d).max():

@@ -26,12 +26,15 @@ class Margins:
     delay: int
 
     def __str__(self):
-        return f"gain margin {self.gain:.3g}, phase margin {self.phase:.3g} deg, modulus margin {self.modulus:.3g}, bears {self.delay} extra samples of delay"
+        return (
+            f"gain margin {self.gain:.3g}, phase margin {self.phase:.3g} deg, modulus margin {self.modulus:.3g}, "
+            f"bears {self.delay} extra samples of delay"
+        )
 
 
 def state_space(numerator, denominator):
     """(A, B, C, D) of a rational function in lambda, controllable form."""
-    n = max(len(numerator), len(denominator)) - 1
+    n = max(len(numerator), len(denominator), 2) - 1  # a constant keeps one idle state
     num = np.zeros(n + 1)
     den = np.zeros(n + 1)
     num[: len(numerator)], den[: len(denominator)] = numerator, denominator
@@ -89,7 +92,8 @@ def norms_of(problem: TrackingProblem, q) -> dict:
     sensitivity = -loop
     sensitivity[0] += 1.0
     found = {
-        "error_r": np.abs(square - problem.r_bar * loop).sum(), "error_w": problem.w_bar * np.abs(np.convolve(G, sensitivity)[:count]).sum(),
+        "error_r": np.abs(square - problem.r_bar * loop).sum(),
+        "error_w": problem.w_bar * np.abs(np.convolve(G, sensitivity)[:count]).sum(),
         "control_r": problem.r_bar * np.abs(q).sum(), "control_w": problem.w_bar * np.abs(loop).sum(),
         "robust": np.abs(np.convolve(W, q)[:count]).sum(),
     }  # fmt: skip
@@ -231,7 +235,6 @@ class Controller:
             for k in range(z.start + 1, size):
                 A[k, k - 1] = 1.0
         return float(np.abs(np.linalg.eigvals(A)).max())
-
 
     def _radius_direct(self, extra):
         Ak, Bk, Ck, Dk = self.direct

@@ -40,7 +40,9 @@ def optimal_sensitivity(zeros, poles=(), horizon: int = 80) -> Optimum:
     try:
         places, resonances = [Fraction(z) for z in zeros], [Fraction(p) for p in poles]
     except (TypeError, ValueError):
-        raise ConfigurationError("zeros and poles must be real numbers (int, Fraction or text like '3/2'); for complex ones call design with u_bar=inf") from None
+        raise ConfigurationError(
+            "zeros and poles must be real numbers (int, Fraction or text like '3/2'); for complex ones call design with u_bar=inf"
+        ) from None
     if not (places or resonances) or any(abs(p) >= 1 for p in places + resonances):
         raise ConfigurationError("give the zeros and poles inside the unit disc, |lambda| < 1; those outside do not constrain S")
     if set(places) & set(resonances):
@@ -71,7 +73,14 @@ def _rational(points, wanted, support, dual):
     S = _solve(columns, wanted)
     if S is None:
         return None
-    signs = [Fraction(1) if v > 0 else Fraction(-1) if v < 0 else Fraction(int(np.sign(np.dot(dual, [float(c[i]) for c in columns])) or 1)) for i, v in enumerate(S)]
+    signs = [
+        Fraction(1)
+        if v > 0
+        else Fraction(-1)
+        if v < 0
+        else Fraction(int(np.sign(np.dot(dual, [float(c[i]) for c in columns])) or 1))
+        for i, v in enumerate(S)
+    ]
     multipliers = _solve([list(row) for row in zip(*columns, strict=True)], signs)
     if multipliers is None:
         return None

@@ -50,7 +50,8 @@ def static_bound(plant: PlainActuator, delta_I=None, mass_errors=None, density_m
         beyond = np.abs(np.asarray(wanted, float) - operator.offset) > operator.total
         if beyond.any():
             raise ConfigurationError(
-                f"Prop. 4.1 needs targets within {operator.offset - operator.total:.5g} .. {operator.offset + operator.total:.5g} A/m; "
+                f"Prop. 4.1 needs targets within {operator.offset - operator.total:.5g} .. "
+                f"{operator.offset + operator.total:.5g} A/m; "
                 f"sample {int(np.argmax(beyond))} asks for {np.ravel(wanted)[np.argmax(beyond)]:.5g}"
             )
     masses = _masses(plant)
@@ -78,7 +79,10 @@ def forward_bound(plant: PlainActuator, h: float, g_bar=None) -> Bound:
     C = slope_limit(plant)
     r = h * plant.c1 / plant.c0
     if not 0 < r < 2:
-        raise ConfigurationError(f"h = {h:.4g} s breaks Prop. 4.2 (h c1/c0 = {r:.3g}, must be below 2); the largest h that holds is {2 * plant.c0 / plant.c1:.4g} s")
+        raise ConfigurationError(
+            f"h = {h:.4g} s breaks Prop. 4.2 (h c1/c0 = {r:.3g}, must be below 2); "
+            f"the largest h that holds is {2 * plant.c0 / plant.c1:.4g} s"
+        )
     g = C / (C + 2) if g_bar is None else _inside(g_bar, C)
     gamma = max(g, (C - g) / (1 + C)) / (1 - max(r - 1, 1 - r / (1 + C)))
     value = 2 * C * gamma * 0.5 * (plant.operator.high - plant.operator.low)
@@ -111,7 +115,9 @@ def decoupled_current(plant: PlainActuator, wanted, h: float, g_bar: float, forw
     return H, (1 + g_bar) / plant.c1 * (H - before) / h + (last - plant.H_bias) / plant.c0
 
 
-def simulated_worst(plant: PlainActuator, h: float, g_bar: float, forward: bool = False, trials: int = 20, length: int = 200, seed: int = 0) -> float:
+def simulated_worst(
+    plant: PlainActuator, h: float, g_bar: float, forward: bool = False, trials: int = 20, length: int = 200, seed: int = 0
+) -> float:
     """Largest |e_M|, A/m, of scheme (10) over random wanted sequences, run through (9) by the same differences."""
     rng = np.random.default_rng(seed)
     low = plant.operator.offset - plant.operator.total
@@ -119,7 +125,11 @@ def simulated_worst(plant: PlainActuator, h: float, g_bar: float, forward: bool 
     worst = 0.0
     for _ in range(trials):
         jumps = rng.random() < 0.5
-        wanted = rng.uniform(low, top, length) if jumps else 0.5 * (low + top) + 0.49 * (top - low) * np.sin(np.cumsum(rng.uniform(0, 0.3, length)))
+        wanted = (
+            rng.uniform(low, top, length)
+            if jumps
+            else 0.5 * (low + top) + 0.49 * (top - low) * np.sin(np.cumsum(rng.uniform(0, 0.3, length)))
+        )
         H, current = decoupled_current(plant, wanted, h, g_bar, forward)
         operator = plant.operator.copy()
         v = H[0]

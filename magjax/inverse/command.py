@@ -33,12 +33,20 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
     left = [e for e in plant.effects if e not in known]
     text = f"current {current.min():.4g} .. {current.max():.4g} A; wrote {out}"
     if infeasible.any():
-        text += f"; {int(infeasible.sum())} samples were not feasible (0 <= u <= M_s^2) and the nearest was taken (column displacement_m), first at t = {time[np.argmax(infeasible)]:.4g} s"
+        text += f"; {int(infeasible.sum())} samples were not feasible (0 <= u <= M_s^2) and the nearest was taken "
+        text += f"(column displacement_m), first at t = {time[np.argmax(infeasible)]:.4g} s"
     if saturated.any():
-        text += f"; {int(saturated.sum())} samples need a magnetization outside the fitted plane, first at t = {time[np.argmax(saturated)]:.4g} s"
+        text += f"; {int(saturated.sum())} samples need a magnetization outside the fitted plane, "
+        text += f"first at t = {time[np.argmax(saturated)]:.4g} s"
     if left:
         text += f"; not compensated: {', '.join(left)}"
-    return {"file": str(out), "infeasible": int(infeasible.sum()), "saturated": int(saturated.sum()), "not_compensated": left, "message": text}
+    return {
+        "file": str(out),
+        "infeasible": int(infeasible.sum()),
+        "saturated": int(saturated.sum()),
+        "not_compensated": left,
+        "message": text,
+    }
 
 
 def load_actuator(bench, model):
@@ -77,5 +85,7 @@ def read_trajectory(path):
     uneven = np.abs(steps - np.median(steps)) > 1e-3 * abs(np.median(steps))
     if uneven.any() or not np.median(steps) > 0:
         k = int(np.argmax(uneven))
-        raise RecordingError(f"{path}: time is not uniform at sample {k + 1} (step {steps[k]:.6g} s, usually {np.median(steps):.6g}); resample it")
+        raise RecordingError(
+            f"{path}: time is not uniform at sample {k + 1} (step {steps[k]:.6g} s, usually {np.median(steps):.6g}); resample it"
+        )
     return time, wanted

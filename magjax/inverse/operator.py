@@ -27,7 +27,9 @@ class PlainPreisach:
             raise ConfigurationError(f"masses must be L x L, not {masses.shape}")
         if masses.min() < 0:
             row, column = np.unravel_index(int(masses.argmin()), masses.shape)
-            raise ConfigurationError(f"masses[{row}, {column}] is negative: the operator is not monotone and has no inverse; use masses >= 0")
+            raise ConfigurationError(
+                f"masses[{row}, {column}] is negative: the operator is not monotone and has no inverse; use masses >= 0"
+            )
         self.cells, self.low, self.high, self.offset = len(masses), float(low), float(high), float(offset)
         self.step = (self.high - self.low) / self.cells
         self.levels = [self.low + self.step * k for k in range(self.cells)] + [self.high]
@@ -105,7 +107,11 @@ class PlainPreisach:
             return self.magnetization
         rising = field > self.field
         base, m_base = self._direction(rising)
-        while len(self.extrema) >= 2 and (self.extrema[-2][0] <= field if rising else self.extrema[-2][0] >= field) and len(self.extrema) >= 3:
+        while (
+            len(self.extrema) >= 2
+            and (self.extrema[-2][0] <= field if rising else self.extrema[-2][0] >= field)
+            and len(self.extrema) >= 3
+        ):
             del self.extrema[-2:]
             base, m_base = self.extrema[-1]
         if len(self.extrema) == 2 and not rising and field <= self.extrema[0][0]:

@@ -40,7 +40,12 @@ def test_gamma_is_monotone_and_falls_by_the_stated_share():
 
 @pytest.mark.parametrize(
     ("zeros", "poles", "value"),
-    [((0,), ("1/2",), Fraction(3)), ((0, "1/2"), ("2/3",), Fraction(149, 14)), (("1/2",), ("4/5",), Fraction(168, 43)), ((0, "1/2"), ("1/5",), Fraction(26))],
+    [
+        ((0,), ("1/2",), Fraction(3)),
+        ((0, "1/2"), ("2/3",), Fraction(149, 14)),
+        (("1/2",), ("4/5",), Fraction(168, 43)),
+        ((0, "1/2"), ("1/5",), Fraction(26)),
+    ],
 )
 def test_pure_sensitivity_is_exact_in_rationals(zeros, poles, value):
     found = optimal_sensitivity(zeros, poles)
@@ -77,6 +82,16 @@ def test_reduced_controller_keeps_the_rows_and_python_control_agrees(u_bar):
         rebuilt = rebuilt_norms(controller)
         for name, value in controller.norms.items():
             assert rebuilt[name] == pytest.approx(value, abs=1e-6 * max(1.0, controller.gamma)), name
+
+
+def test_a_constant_controller_is_realized():
+    """At T = 50 ms the rod is at rest between samples: Q is a number."""
+    from magjax.control.models import rebuilt_norms
+
+    made = design(TrackingProblem(plant=rod(T=0.05), T=0.05))
+    controller = reduced_controller(made)
+    assert rebuilt_norms(controller)["error_r"] == pytest.approx(controller.norms["error_r"], abs=1e-6)
+    assert design(TrackingProblem(weight=weight(0.0))).gap < 1e-6
 
 
 def test_margins_say_what_a_delay_does():
@@ -155,14 +170,24 @@ def test_plants_with_zeros_inside_the_disc_are_certified_by_interpolation(numera
 def test_lower_bound_stays_below_what_longer_controllers_reach():
     for robust in (True, False):
         short = design(TrackingProblem(weight=weight(30 * C_W_UM), robust=robust), taps=12)
-        assert short.lower <= design(TrackingProblem(weight=weight(30 * C_W_UM), robust=robust), taps=80).gamma <= short.gamma * (1 + 1e-7)
+        assert (
+            short.lower
+            <= design(TrackingProblem(weight=weight(30 * C_W_UM), robust=robust), taps=80).gamma
+            <= short.gamma * (1 + 1e-7)
+        )
 
 
 def test_no_jax_behind_inversion_and_control():
     root = Path(__file__).resolve().parents[2] / "magjax"
     for path in [*root.glob("control/*.py"), *root.glob("inverse/*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names = (
+                [a.name for a in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module or ""]
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
             assert not {n.split(".")[0] for n in names} & {"jax", "equinox", "optimistix", "fitting"}, path.name
 
 

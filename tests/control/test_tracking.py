@@ -22,7 +22,9 @@ def plant():
 
 def test_strategies_rank_as_in_the_paper(plant):
     time, wanted = sinusoid(plant, 5e-4)
-    error = {s: track(plant, plant, time, wanted, s).errors()[0] for s in ("proportional", "static_inverse", "dynamic_inverse", "l1")}
+    error = {
+        s: track(plant, plant, time, wanted, s).errors()[0] for s in ("proportional", "static_inverse", "dynamic_inverse", "l1")
+    }
     assert error["dynamic_inverse"] < 0.05 * error["static_inverse"] < error["proportional"]
     assert error["l1"] < error["proportional"] and error["dynamic_inverse"] < 5e-8
 
@@ -53,7 +55,9 @@ def test_noise_reaches_feedback_only(plant):
 def test_what_is_out_of_reach_is_counted(plant):
     time, wanted = sinusoid(plant, 5e-4, periods=2)
     for strategy in ("static_inverse", "dynamic_inverse"):
-        assert track(plant, plant, time, wanted, strategy).saturated == 0 < track(plant, plant, time, 2.5 * wanted, strategy).saturated
+        assert (
+            track(plant, plant, time, wanted, strategy).saturated == 0 < track(plant, plant, time, 2.5 * wanted, strategy).saturated
+        )
 
 
 def test_interconnected_loop_is_the_study(plant):
@@ -68,7 +72,9 @@ def test_interconnected_loop_is_the_study(plant):
     T, model = 5e-4, perturbed(plant)
     time, wanted = sinusoid(plant, T, periods=2)
     run = track(plant, model, time, wanted, "l1")
-    controller = reduced_controller(design(TrackingProblem(plant=rod(model.f0, model.xi, T, 1e6 * model.l_rod * model.lambda_s), T=T)))
+    controller = reduced_controller(
+        design(TrackingProblem(plant=rod(model.f0, model.xi, T, 1e6 * model.l_rod * model.lambda_s), T=T))
+    )
     loop = tracking_loop(controller, plant, model)
     assert loop.input_labels == ["reference_um"] and loop.output_labels == ["displacement_m", "control_Ms2", "current_A"]
     ahead = 1e6 * wanted[np.minimum(np.arange(len(time)) + 2, len(time) - 1)]
@@ -137,10 +143,21 @@ def test_commands(tmp_path, capsys, monkeypatch):
     assert status == 0 and json.loads(said.out)["rms_m"] < 1e-7 and (tmp_path / "track.csv").exists()
     status, said = command(["bounds", "--json", "--T", "5e-4"], capsys)
     summary = json.loads(said.out)
-    assert "largest h that holds" in summary["4.2"]["note"] and summary["4.3"]["simulated_A_per_m"] <= summary["4.3"]["bound_A_per_m"]
+    assert (
+        "largest h that holds" in summary["4.2"]["note"] and summary["4.3"]["simulated_A_per_m"] <= summary["4.3"]["bound_A_per_m"]
+    )
 
 
 def test_command_errors_are_one_line(capsys):
-    for arguments, words in ((["fly"], "no action"), (["design", "--u-bar", "-1"], "u_bar"), (["design", "--w-bar", "0"], "w_bar"), (["simulate", "--strategy", "x"], "unknown")):
+    wrong = (
+        (["fly"], "no action"),
+        (["design", "--u-bar", "-1"], "u_bar"),
+        (["design", "--w-bar", "0"], "w_bar"),
+        (["design", "--taps", "2"], "taps"),
+        (["design", "--c-w", "-1"], "c_w"),
+        (["simulate", "--T", "0"], "sample time"),
+        (["simulate", "--strategy", "x"], "unknown"),
+    )
+    for arguments, words in wrong:
         status, said = command(arguments, capsys)
         assert status == 2 and words in said.err and said.err.count("\n") == 1

@@ -19,7 +19,9 @@ def plant_with(seed=0, L=25):
     rng = np.random.default_rng(seed)
     masses = np.tril(rng.random((L, L)) * (rng.random((L, L)) > 0.5))
     masses *= 7e5 / masses.sum()
-    return PlainActuator(PlainPreisach(masses, -3100.0, 27700.0), 70.0, 1.54e4, 1.23e4, 1300, 2.83e-5, 1.313e-3, 7.87e5, 5.13e-2, 392.0, 0.7783)
+    return PlainActuator(
+        PlainPreisach(masses, -3100.0, 27700.0), 70.0, 1.54e4, 1.23e4, 1300, 2.83e-5, 1.313e-3, 7.87e5, 5.13e-2, 392.0, 0.7783
+    )
 
 
 def test_semigroup():

@@ -56,7 +56,9 @@ def test_many_random_cases_with_every_edge():
         cells = int(rng.integers(1, 30))
         masses = np.tril(rng.random((cells, cells)))
         kind = rng.integers(4)
-        masses *= (rng.random(masses.shape) > (0.0, 0.5, 0.9, 0.0)[kind]) * (np.exp(8 * rng.standard_normal(masses.shape)) if kind == 3 else 1.0)
+        masses *= (rng.random(masses.shape) > (0.0, 0.5, 0.9, 0.0)[kind]) * (
+            np.exp(8 * rng.standard_normal(masses.shape)) if kind == 3 else 1.0
+        )
         if masses.sum() == 0:
             continue
         plain = PlainPreisach(masses / masses.sum(), LOW, HIGH)
@@ -151,7 +153,9 @@ def test_invert_command_offers_the_nearest_and_refuses_uneven_time(tmp_path, cap
     uneven = t.copy()
     uneven[300] += 5e-5
     for name, time, wanted in (("far", t, far), ("near", t, 33.0 + 0.1 * (far - 33.0)), ("uneven", uneven, far)):
-        np.savetxt(tmp_path / f"{name}.csv", np.stack([time, wanted], axis=1), delimiter=",", header="time_s,displacement_um", comments="")
+        np.savetxt(
+            tmp_path / f"{name}.csv", np.stack([time, wanted], axis=1), delimiter=",", header="time_s,displacement_um", comments=""
+        )
     out = tmp_path / "current.csv"
     assert main(["invert", str(tmp_path / "far.csv"), "--out", str(out)]) == 0
     assert "not feasible" in capsys.readouterr().out and out.read_text().startswith("time_s,current_A,displacement_m")
