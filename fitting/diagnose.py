@@ -173,8 +173,30 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
         candidates = screen(best.result.problem, best.result.refined)
+    _backward(recordings, bench, state, chosen, count, progress)
     state.unexplained = max(chi2_of(state.current) - count, 0.0)
     return state
+
+
+def _backward(recordings, bench, state, chosen, count, progress):
+    """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open.
+
+    The form error of a right effect looks like another effect until the rest is in place.
+    """
+    say = progress or (lambda *a: None)
+    for step in state.steps[:-1][::-1]:
+        name = step[0].name
+        actuator = state.current.actuator
+        if name not in {e.name for e in actuator.effects}:
+            continue
+        say(f"without {name}", 0, state.current.chi2_per_sample)
+        fewer = actuator.without_effect(name)
+        held = tuple(f"effects.{e.name}.{p}" for e in fewer.effects for p in e.parameters())
+        trial = fit(recordings, bench, actuator=fewer, extra=held, choices=chosen, refine=False, progress=progress)
+        rise = chi2_of(trial) - chi2_of(state.current)
+        if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
+            state.steps.remove(step)
+            state.current = trial
 
 
 def _finer(recordings, bench, current, best, good, chosen, excess, progress):
@@ -218,11 +240,12 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     share = 1 - max(excess - 1, 0) / max(base_now.chi2_per_sample - 1, 1e-9) if base_now.chi2_per_sample > SILENT_CHI2 else 1.0
     if missing and (not state.steps or share < FULL_SHARE or excess > FAR_FROM_NOISE):
         return _unknown(state, share, excess, common)
+    worse = [r for r in rows if r["rms_after"] > 1.05 * r["rms_before"] and r["rms_after"] > 1.3 * r["noise_rms"]]
+    if state.steps and rows and len(worse) == len(rows):  # a repair that predicts nothing better is not physics
+        return _unknown(state, share, excess, common, " The repair that fits best predicts every check recording worse, so it is not named.")
     if not effects and not groups:
-        smallest = min((c.smallest_visible for c in candidates if c.visibility > 0.05), default=None)
         text = f"nothing is missing: chi2/N = {excess:.2f} and no effect of the catalogue scores above {Z_THRESHOLD} (highest: "
         text += f"{candidates[0].name}, z = {candidates[0].z:.1f})." if candidates else "none)."
-        del smallest
         if common["absorbed"]:
             text += f" These recordings could not show {', '.join(common['absorbed'])}: the density absorbs them."
         return Diagnosis("nothing_missing", text, **common)
@@ -242,7 +265,7 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     return Diagnosis("attributed", text, tuple(effects), **common)
 
 
-def _unknown(state, share, excess, common) -> Diagnosis:
+def _unknown(state, share, excess, common, note: str = "") -> Diagnosis:
     blocks = common["where"]["by_block"]
     block = max(blocks, key=blocks.get) if blocks else "hysteresis"
     fields = common["where"]["by_field"]
@@ -253,7 +276,7 @@ def _unknown(state, share, excess, common) -> Diagnosis:
         f"{max(share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."
     )
     unknown = {"block": block, "region": region, "explained_share": float(np.clip(share, 0, 1))}
-    return Diagnosis("unknown_at", text, unknown=unknown, **common)
+    return Diagnosis("unknown_at", text + note, unknown=unknown, **common)
 
 
 def _effect_row(trial, tried, previous, final) -> dict:

@@ -154,21 +154,6 @@ def test_unfold_finds_the_sign_of_M():
     assert unfold(np.abs(drive + 3), drive) == pytest.approx(drive + 3)
 
 
-def test_rod_in_a_coil(measured):
-    """Measured: the main job runs on real captures. The value of k is not established (see the README's limits)."""
-    from fitting.check import check_errors
-    from magjax.recording import load_recordings
-
-    bench = load_bench("rod-eddy")
-    folder = measured / "rod_eddy"
-    runs = load_recordings([folder / "captures_f010.csv", folder / "captures_f050.csv"], bench)
-    got = fit(runs, bench, refine=False)
-    k = got.estimate("coil.k_eddy")
-    assert 0.03 < k.value < 0.08 and k.stderr < 0.01
-    row = check_errors(got.actuator, got.actuator, load_recordings([folder / "captures_f020.csv"], bench), bench)[0]
-    assert row["rms_after"] < 1.7 * row["noise_rms"]
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(40))
 def test_constants_within_their_errors_at_forty_seeds(bench, seed):

@@ -1,0 +1,1 @@
+"""Long studies whose tables the README quotes; each is a command."""
