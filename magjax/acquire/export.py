@@ -9,8 +9,8 @@ from ..errors import ConfigurationError
 from .log import read_log
 from .protocol import COLUMNS, SI
 
-UNITS = {COLUMNS[q]: next(iter(units)) for q, units in SI.items()}
-QUANTITIES = {column: quantity for quantity, column in COLUMNS.items()}
+UNITS = {COLUMNS[q]: next(iter(units)) for q, units in SI.items()} | {"command_A": "A"}
+QUANTITIES = {column: quantity for quantity, column in COLUMNS.items()} | {"command_A": "command"}
 
 
 def export_log(path, target) -> list[Path]:
@@ -19,9 +19,7 @@ def export_log(path, target) -> list[Path]:
     Raises `ConfigurationError` for an unknown ending or a place that cannot be written, `RecordingError` for an empty log.
     """
     path, target = Path(path), Path(target)
-    writer = {".nc": _netcdf, ".csv": _csv, ".mat": _mat, ".parquet": _parquet}.get(target.suffix.lower())
-    if writer is None:
-        raise ConfigurationError(f"{target}: ending {target.suffix or '(none)'} is unknown; write .nc, .csv, .mat or .parquet")
+    writer = known_ending(target)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     segments, written = read_log(path), []
     for k, (table, metadata) in enumerate(segments):
@@ -66,3 +64,14 @@ def _parquet(path, table, metadata):
     made = pyarrow.table({c: np.asarray(v, float) for c, v in table.items()})
     made = made.replace_schema_metadata({k: str(v) for k, v in metadata.items()})
     pyarrow.parquet.write_table(made, path)
+
+
+WRITERS = {".nc": _netcdf, ".csv": _csv, ".mat": _mat, ".parquet": _parquet}
+
+
+def known_ending(target: Path):
+    """The writer for a file's ending; raises `ConfigurationError` for one that is unknown."""
+    writer = WRITERS.get(target.suffix.lower())
+    if writer is None:
+        raise ConfigurationError(f"{target}: ending {target.suffix or '(none)'} is unknown; write {', '.join(WRITERS)}")
+    return writer

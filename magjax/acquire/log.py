@@ -219,9 +219,10 @@ class Log:
         parts = sorted((p for p in self.pieces if p[0] == number), key=lambda p: p[1])
         index = np.concatenate([p[1] + np.arange(len(p[4])) for p in parts])
         values = np.concatenate([p[4] for p in parts])
-        _, first, begin, _, _ = parts[0]
-        span = parts[-1][1] + len(parts[-1][4]) - 1 - first
-        rate = self.started(number).get("rate_Hz") or (1e6 * span / max(parts[-1][3] - begin, 1) if span else 1.0)
+        (_, first, begin, last, counts), (_, late, later, *_) = parts[0], parts[-1]
+        rate = self.started(number).get("rate_Hz")
+        if not rate:  # a text device states none: from its clock, begin of piece to begin of piece
+            rate = 1e6 * (late - first) / (later - begin) if later > begin else 1e6 * max(len(counts) - 1, 1) / max(last - begin, 1)
         return index, begin - 1e6 * first / rate, rate, values
 
 
@@ -231,6 +232,7 @@ def read_log(path) -> list[tuple[dict, dict]]:
     Lost samples are left out, so that the time shows the gap; what came before the steady state is left out too.
     Raises `RecordingError` where nothing can be read.
     """
+    from .order import commanded
     from .protocol import Channel
 
     log = Log(path)
@@ -245,6 +247,10 @@ def read_log(path) -> list[tuple[dict, dict]]:
         index, values = index[keep], values[keep]
         table = {"time_s": (index - index[0]) / rate}
         table |= {c.column: c.to_si(values[:, k]) for k, c in enumerate(channels)}
+        if "command" in start:
+            table["command_A"] = commanded(start["command"], index)
+            if not {"current_A", "field_A_per_m"} & set(table):
+                table["current_A"] = table["command_A"]
         found.append((table, _metadata(log, number, start, index)))
     if not found:
         raise RecordingError(f"{path}: the log holds no samples; record again")
@@ -255,6 +261,7 @@ def _metadata(log, number, start, index) -> dict:
     flat = {k: v for k, v in log.header.items() if isinstance(v, (str, int, float)) and not isinstance(v, bool)}
     flat["calibration"] = json.dumps(log.header.get("channels", []))
     flat |= {k: v for k, v in start.items() if k in ("frequency_Hz", "rate_Hz", "run", "drive", "boot_id")}
+    flat["current"] = "measured" if any(c["name"] == "current" for c in log.header.get("channels", [])) else "command"
     flat["segment"] = number
     flat["lost_samples"] = int(index[-1] - index[0] + 1 - len(index))
     flat["ended"] = (log.end or {}).get("reason", "without an end: the recorder was killed or the tail is damaged")

@@ -16,6 +16,9 @@ COMMANDS = {
     "report": ("magjax.cli.fit", "build the HTML report of a result folder again"),
     "invert": ("magjax.cli.control", "a wanted displacement to the current to apply"),
     "control": ("magjax.cli.control", "l1 design, margins, closed-loop simulation"),
+    "ports": ("magjax.cli.acquire", "serial ports of this machine"),
+    "emulate": ("magjax.cli.acquire", "a bench as a device behind a pseudo-terminal or TCP port"),
+    "record": ("magjax.cli.acquire", "a crash-safe recording from a device, or a whole plan"),
 }
 
 

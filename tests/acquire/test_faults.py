@@ -1,0 +1,235 @@
+"""Faults between real processes: nothing acknowledged is lost, nothing corrupt is read as good, every loss is counted."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import verify
+
+from magjax.acquire.framing import encode
+from magjax.acquire.link import ask_hello, open_port
+from magjax.acquire.log import Log
+from magjax.acquire.process import record
+from magjax.acquire.protocol import STOP, bare_packet
+from magjax.recording import load_recordings
+
+
+def events(path, kind):
+    return [e for e in Log(path).events if e["event"] == kind]
+
+
+def drive_now(port):
+    device = open_port(port)
+    hello = ask_hello(device, 3.0)
+    device.close()
+    return hello.content["drive_now"], hello.running
+
+
+def recorder(order, **options):
+    """A recorder process, already ordered."""
+    place = Path(order.path + ".order")
+    place.write_text(order.to_json() + "\n")
+    with open(place) as stream:
+        return subprocess.Popen([sys.executable, "-m", "magjax.acquire.process"], stdin=stream, stdout=subprocess.PIPE, text=True,
+                                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, **options)  # fmt: skip
+
+
+def test_clean_run_over_a_pty_and_tcp(emulate, order):
+    for options in (("--fast",), ("--fast", "--tcp", "0")):
+        port = emulate(*options)["port"]
+        made = order(port)
+        made.path = made.path.replace("run.mjlog", f"run{len(options)}.mjlog")
+        end = record(made)
+        assert end["status"] == 0, end
+        assert (end["status"], end["reason"], end["received"], end["lost"]) == (0, "done", 100_000, 0)
+        log = verify(made.path)
+        assert log.samples == 100_000 and log.end["reason"] == "done" and not log.damage
+        assert drive_now(port) == (0, False)
+
+
+@pytest.mark.parametrize("faults", [("drop=2e-5",), ("flip=2e-5",), ("merge=0.02", "duplicate=0.05"), ("zeros=200000",), ("drop=3e-5", "flip=3e-5", "merge=0.01")])
+def test_damage_on_the_line_is_counted_exactly(emulate, order, faults):
+    words = [w for f in faults for w in ("--fault", f)]
+    port = emulate("--fast", "--seed", "3", *words)["port"]
+    made = order(port)
+    end = record(made)
+    assert end["status"] == 0 and end["tail_known"]
+    log = verify(made.path)
+    assert end["received"] + end["lost"] == end["sent"] == 100_000
+    assert log.samples == end["received"]
+    if faults == ("zeros=200000",):
+        assert end["lost"] == 0
+    else:
+        assert 0 < end["lost"] < 30_000 and end["damaged_frames"] > 0
+    if "duplicate=0.05" in faults:
+        assert end["repeats"] > 10
+
+
+def test_counters_and_clock_wrap(emulate, order):
+    port = emulate("--fast", "--fault", "wrap")["port"]
+    made = order(port, rate=50e3)
+    end = record(made)
+    assert (end["status"], end["received"], end["lost"]) == (0, 100_000, 0)
+    log = verify(made.path)
+    begin, last = log.pieces[0][2], log.pieces[-1][3]
+    assert begin < 2**32 < last and last - begin == pytest.approx(2e6, rel=0.01)
+
+
+def test_a_reset_is_an_event_and_the_run_starts_anew(emulate, order):
+    port = emulate("--fast", "--fault", "reset=300")["port"]
+    made = order(port)
+    end = record(made)
+    assert end["status"] == 0 and end["segments"] == 2
+    assert len(events(made.path, "reset")) == 1
+    log = verify(made.path)
+    assert sum(len(p[4]) for p in log.pieces if p[0] == 1) == 100_000
+    assert len({e["boot_id"] for e in events(made.path, "start")}) == 2
+
+
+def test_a_stall_is_told_and_its_losses_counted(emulate, order):
+    port = emulate("--fault", "stall=1.5", "--fault", "at=200")["port"]
+    made = order(port, samples=150_000, stall_s=0.5)
+    end = record(made)
+    assert end["status"] == 0 and events(made.path, "stall")
+    assert end["received"] + end["lost"] == end["sent"] == 150_000 and end["lost"] > 10_000
+    assert end["dropped_by_device"] > 0
+    verify(made.path)
+
+
+def test_unplugged_and_back_under_another_name(emulate, order, tmp_path):
+    port = emulate("--link", str(tmp_path / "ttyEMU"), "--fault", "unplug=0.7")["port"]
+    made = order(port, samples=120_000)
+    end = record(made)
+    assert end["status"] == 0, end
+    assert events(made.path, "reconnect")[0]["port"].endswith("ttyEMU1") and events(made.path, "disconnect")
+    assert end["received"] + end["lost"] == end["sent"] == 120_000 and end["lost"] > 0 and end["segments"] == 1
+    verify(made.path)
+
+
+def test_unplugged_for_good_ends_early_with_an_intact_file(emulate, order, tmp_path):
+    device = emulate("--link", str(tmp_path / "ttyEMU"))
+    child = recorder(order(device["port"], samples=0, give_up_s=1.0))
+    time.sleep(1.5)
+    device["process"].kill()
+    text, _ = child.communicate(timeout=20)
+    last = json.loads(text.strip().splitlines()[-1])
+    assert child.returncode == last["status"] == 6 and "unplugged" in last["reason"] and "watchdog" in last["drive_at_zero"]
+    log = verify(tmp_path / "run.mjlog")
+    assert log.end["reason"] == last["reason"] and log.samples == last["acknowledged"] > 0
+
+
+def test_a_stopped_reader_loses_and_counts(emulate, order):
+    port = emulate("--baud", "2000000", "--watchdog", "5")["port"]
+    made = order(port, rate=40e3, samples=120_000)
+    child = recorder(made)
+    time.sleep(1.2)
+    child.send_signal(signal.SIGSTOP)
+    time.sleep(1.5)
+    child.send_signal(signal.SIGCONT)
+    text, _ = child.communicate(timeout=30)
+    end = json.loads(text.strip().splitlines()[-1])
+    assert end["status"] == 0 and end["received"] + end["lost"] == end["sent"] == 120_000
+    assert end["lost"] > 0 and end["dropped_by_device"] > 0
+    verify(made.path)
+
+
+def test_ctrl_c_stops_in_order(emulate, order):
+    port = emulate()["port"]
+    made = order(port, samples=0)
+    child = recorder(made)
+    time.sleep(1.2)
+    assert child.poll() is None
+    child.send_signal(signal.SIGINT)
+    text, _ = child.communicate(timeout=20)
+    end = json.loads(text.strip().splitlines()[-1])
+    assert child.returncode == 130 and end["reason"] == "interrupted" and end["drive_at_zero"] == "confirmed"
+    assert end["received"] + end["lost"] == end["sent"]
+    assert verify(made.path).samples == end["acknowledged"] > 0
+    assert drive_now(port) == (0, False)
+
+
+def test_a_full_disk_ends_the_recording_with_the_drive_at_zero(emulate, order):
+    port = emulate("--fast")["port"]
+    made = order(port, samples=5_000_000)
+
+    def limited():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+
+    child = recorder(made, preexec_fn=limited)
+    text, _ = child.communicate(timeout=30)
+    end = json.loads(text.strip().splitlines()[-1])
+    assert child.returncode == 6 and "run.mjlog" in end["reason"] and end["drive_at_zero"] == "confirmed"
+    log = verify(made.path)
+    assert log.samples == end["acknowledged"] > 50_000 and not log.damage
+    assert drive_now(port) == (0, False)
+
+
+def kill_at(order, seconds):
+    """Kill -9 after a while; how many samples the recorder had acknowledged by then."""
+    child = recorder(order)
+    time.sleep(seconds)
+    child.kill()
+    text, _ = child.communicate()
+    states = [json.loads(line) for line in text.splitlines() if line.endswith("}")]
+    return states[-1]["acknowledged"] if states else 0
+
+
+def killed_at_random(emulate, order, count, durable):
+    """kill -9 at random moments: all acknowledged samples are in the log, and the device's watchdog ends the run."""
+    port = emulate("--watchdog", "0.4")["port"]
+    random = np.random.default_rng(count)
+    kept = 0
+    for k in range(count):
+        made = order(port, samples=0, durable=durable)
+        made.path = made.path.replace("run.mjlog", f"run{k}.mjlog")
+        acknowledged = kill_at(made, random.uniform(0.3, 2.0))
+        if os.path.exists(made.path):
+            log = verify(made.path)
+            assert log.samples >= acknowledged and len(log.damage) <= 1 and log.end is None
+            kept += acknowledged > 0
+        time.sleep(0.5)
+    assert kept > 0.3 * count
+    assert drive_now(port) == (0, False)
+
+
+def test_killed_at_random_moments(emulate, order):
+    killed_at_random(emulate, order, 4, False)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("durable", [False, True])
+def test_killed_at_a_hundred_random_moments(emulate, order, durable):
+    killed_at_random(emulate, order, 100, durable)
+
+
+def test_a_killed_recording_is_resumed(emulate, order, tmp_path):
+    port = emulate("--watchdog", "0.4")["port"]
+    made = order(port, samples=0)
+    assert kill_at(made, 2.0) > 0
+    with open(made.path, "ab") as stream:
+        stream.write(b"MJL1 torn")
+    command = [sys.executable, "-m", "magjax", "record", port, "--out", made.path, "--resume", "--frequency", "100", "--samples", "100", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    log = Log(made.path)
+    assert not log.damage and log.end["reason"] == "done" and [e for e in log.events if e["event"] == "resume"]
+    recordings = load_recordings([made.path], "aa-050h")
+    assert len(recordings) == 2 and recordings[1].frequency() == pytest.approx(100)
+
+
+def test_stop_is_answered_twice_alike(emulate):
+    port = open_port(emulate("--fast")["port"])
+    ask_hello(port, 3.0)
+    port.write(encode(bare_packet(STOP)) * 2)
+    time.sleep(0.3)
+    first, second, _ = port.read(200).split(b"\0")
+    assert first == second
+    port.close()
