@@ -109,15 +109,19 @@ def _read_netcdf(path):
 
 
 def _read_mat(path):
-    try:
-        from scipy.io import loadmat
+    import h5py
 
-        content = loadmat(path, squeeze_me=True)
-    except NotImplementedError:
-        import h5py
-
+    if h5py.is_hdf5(path):  # v7.3
         with h5py.File(path) as file:
             content = {k: np.asarray(v).ravel() for k, v in file.items() if hasattr(v, "shape")}
+    else:
+        from scipy.io import loadmat
+        from scipy.io.matlab import MatReadError
+
+        try:
+            content = loadmat(path, squeeze_me=True)
+        except MatReadError as error:
+            raise RecordingError(f"{path}: not a MATLAB file ({error}); save it again, or export it as CSV") from None
     table = {k: np.asarray(v, float).ravel() for k, v in content.items() if not k.startswith("__") and np.ndim(v) == 1}
     return table, {}
 
