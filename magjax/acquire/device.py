@@ -119,7 +119,7 @@ class Device:
         _, _, run, rate, samples = p.START_BODY.unpack_from(payload)
         rate = 1e-3 * rate
         text = json.dumps({"rate_Hz": rate, "boot_id": self.boot_id})
-        if self.running and run == self.run:
+        if run == self.run:  # sent again: the first answer was lost, or late
             return p.ack_packet(p.START, 0, self.first_seq, text)
         if self.running:
             raise ValueError(f"run {self.run} is on; STOP first")

@@ -260,7 +260,7 @@ def read_log(path) -> list[tuple[dict, dict]]:
 def _metadata(log, number, start, index) -> dict:
     flat = {k: v for k, v in log.header.items() if isinstance(v, (str, int, float)) and not isinstance(v, bool)}
     flat["calibration"] = json.dumps(log.header.get("channels", []))
-    flat |= {k: v for k, v in start.items() if k in ("frequency_Hz", "rate_Hz", "run", "drive", "boot_id")}
+    flat |= {k: v for k, v in start.items() if k in ("frequency_Hz", "rate_Hz", "run", "drive", "boot_id") and v is not None}
     flat["current"] = "measured" if any(c["name"] == "current" for c in log.header.get("channels", [])) else "command"
     flat["segment"] = number
     flat["lost_samples"] = int(index[-1] - index[0] + 1 - len(index))

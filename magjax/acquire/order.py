@@ -2,11 +2,14 @@
 
 import dataclasses
 import json
+import secrets
 
 import numpy as np
 
 from ..errors import ConfigurationError, DeviceError
 from . import protocol as p
+
+DECAY, DECAY_WIDTH, DECAY_PERIODS = 0.9, 100, 44
 
 
 @dataclasses.dataclass
@@ -15,8 +18,10 @@ class Order:
 
     `drive`: None, {"kind": "sine", "samples", "periods", "amplitude", "offset", "factor"} (A, made on the device) or {"kind": "table",
     "values", "repeats"} (A, uploaded); `rate`: Hz; `samples`: to keep (0: until stopped), after `settle_samples`; `limit_A`: of drive and
-    measured current; `about`: what the log's start event states (frequency_Hz, drive); `header`: provenance; `text`: columns of a
-    text-line device, "" to wait for its header line; `amplifier`: port of a SCPI amplifier.
+    measured current; `about`: what the log's start event states (frequency_Hz, drive); `header`: provenance; `demagnetize`: a decaying sine from the
+    limit (or the drive's peak) runs before each start, and is not kept; `text`: columns of a
+    text-line device, "" to wait for its header line; `amplifier`: port of a SCPI amplifier. `run`: numbers the run, new for each, so
+    that a START sent twice is one run.
     """
 
     port: str
@@ -32,11 +37,12 @@ class Order:
     resume: bool = False
     resume_from: int = -1
     resume_device: str = ""
+    demagnetize: bool = False
     text: str | None = None
     amplifier: str | None = None
     header: dict = dataclasses.field(default_factory=dict)
     about: dict = dataclasses.field(default_factory=dict)
-    run: int = 1
+    run: int = dataclasses.field(default_factory=lambda: secrets.randbits(31))
     attempts: int = 5
     stall_s: float = 1.0
     give_up_s: float = 15.0
@@ -45,6 +51,7 @@ class Order:
     stop_wait_s: float = 3.0
     loop_samples: int = 1000
     scale: float = 1.0
+    rate_max: float = 1e9
 
     @property
     def total_samples(self) -> int:
@@ -86,7 +93,7 @@ class Order:
             return
         if not hello.drive:
             raise DeviceError(f"{hello.device} has no drive output; record without a drive (--no-drive) and drive the coil otherwise")
-        self.scale = float(hello.drive["scale"])
+        self.scale, self.rate_max = float(hello.drive["scale"]), hello.rate_max
         if self.peak() > float(hello.drive["limit"]) * (1 + 1e-9):
             raise ConfigurationError(f"the drive reaches {self.peak():.4g} A, the device allows {hello.drive['limit']:g} A; lower it")
         room = int(hello.drive["table"])
@@ -105,6 +112,13 @@ class Order:
             return p.drive_packets(self._counts(), drive["repeats"])
         amplitude, offset = round(drive["amplitude"] / self.scale), round(drive["offset"] / self.scale)
         return [p.generate_packet(drive["samples"], drive["periods"], amplitude, offset, drive["factor"])]
+
+    def demagnetizing(self) -> tuple[bytes, float, int]:
+        """GENERATE of a sine that dies out to the drive's offset, its rate in Hz and its samples: 50 Hz, down to a hundredth."""
+        offset = float(self.drive.get("offset", 0.0)) if self.drive["kind"] == "sine" else 0.0
+        amplitude = (self.limit_A or self.peak()) - abs(offset)
+        packet = p.generate_packet(DECAY_WIDTH, DECAY_PERIODS, round(amplitude / self.scale), round(offset / self.scale), DECAY)
+        return packet, min(50.0 * DECAY_WIDTH, self.rate_max), DECAY_WIDTH * DECAY_PERIODS
 
     def command(self) -> dict:
         """The drive in counts, for the log's start event: what `commanded` reads."""

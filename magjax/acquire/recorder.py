@@ -6,6 +6,7 @@ last word; after kill -9 the device's watchdog does the first.
 
 import json
 import os
+import secrets
 import shutil
 import time
 
@@ -112,6 +113,10 @@ class Recorder:
             self.tracker = None
             self.log.event("start", segment=self.segment, **order.about)
             return
+        if self.hello.running:
+            self._end_foreign_run()
+        if order.demagnetize and order.drive:
+            self._demagnetize()
         for packet in order.drive_packets():
             self._command(packet, p.DRIVE if packet[0] == p.DRIVE else p.GENERATE, 5.0)
         run = (order.run + self.segment) & 0xFFFFFFFF
@@ -124,6 +129,31 @@ class Recorder:
         self.quiet_since = time.monotonic()
         for kind, value in backlog:
             self._take(kind, value)
+
+    def _demagnetize(self):
+        """A decaying sine; its samples are not kept."""
+        packet, rate, samples = self.order.demagnetizing()
+        self._command(packet, p.GENERATE, 5.0)
+        self._command(p.start_packet(secrets.randbits(31), rate, samples), p.START, self.order.start_wait_s)
+        end, alive = time.monotonic() + samples / rate + 5.0, 0.0
+        while time.monotonic() < end:
+            if self.stop:
+                raise Ended(*self.stop)
+            if time.monotonic() > alive:
+                self.port.write(encode(p.bare_packet(p.QUERY)))  # keeps the watchdog quiet, and tells when the run is over
+                alive = time.monotonic() + 0.25 * (self.hello.watchdog_s or 2.0)
+            for kind, value in self.adapter.feed(self.port.read(READ)):
+                if kind == p.FINAL or (kind == p.HELLO and not p.read_hello(value).running):
+                    self.log.event("demagnetized", segment=self.segment)
+                    return
+        raise DeviceError(f"{self.order.port}: the demagnetizing drive did not end; check the link")
+
+    def _end_foreign_run(self):
+        """A run that a killed recorder left behind."""
+        end, over = time.monotonic() + self.order.stop_wait_s, False
+        self.port.write(encode(p.bare_packet(p.STOP)))
+        while not over and time.monotonic() < end:
+            over = any(kind == p.FINAL for kind, _ in self.adapter.feed(self.port.read(READ)))
 
     def _command(self, packet, kind, wait, backlog=None):
         """Send a command until it is acknowledged; what else comes is kept in `backlog`."""

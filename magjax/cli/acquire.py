@@ -190,6 +190,41 @@ def _run_single(options, arguments) -> int:
     return finish(summary, options, "record")
 
 
+def campaign(options, arguments, command, live, say):
+    """The campaign that options describe."""
+    from magjax.acquire.campaign import SETTINGS, Campaign
+    from magjax.bench import load_bench
+
+    from .runtime import output_folder
+
+    bench = load_bench(options.bench)
+    limit = options.limit or bench.limits.get("current_A")
+    return Campaign(options.port, bench, output_folder(options.out), limit, dict(SETTINGS), provenance(command, arguments, bench.name),
+                    options.baud, options.durable, options.give_up, say, live)  # fmt: skip
+
+
+def _run_plan(options, arguments) -> int:
+    from magjax.acquire.campaign import entries, read_plan
+    from magjax.acquire.display import Live
+
+    plan = read_plan(options.plan)
+    quiet = options.quiet or options.json
+    with Live(quiet) as live:
+        made = campaign(options, arguments, "record", live, lambda text: None if quiet else print(text, file=sys.stderr))
+        made.settings = plan.settings
+        made.check_limits(entries(plan))
+        rows = made.run(entries(plan, made.rate_max()))
+    status = max((r["status"] for r in rows), key=lambda s: (s in (5, 130), s))
+    good = sum(r["status"] == 0 for r in rows)
+    if options.json:
+        print(json.dumps({"recordings": rows, "good": good}))
+    else:
+        for row in rows:
+            print(f"  {row['name']:32s} {'good' if not row['problems'] else row['problems'][0]}")
+        print(f"{good} of {len(rows)} recordings are fit to use, in {options.out}")
+    return status
+
+
 def _sine(order, options):
     if not options.frequency > 0 or options.samples < 16 or options.periods < 0 or options.settle < 0:
         raise ConfigurationError("give --frequency above zero, --samples of 16 or more, --periods and --settle of zero or more")
@@ -209,7 +244,6 @@ def _resume(order):
     log = Log(order.path)
     order.resume, order.resume_device = True, log.header["device"]
     order.resume_from = max([s[0] for s in log.pieces] + [e["segment"] for e in log.events if "segment" in e], default=-1)
-    order.run = order.resume_from + 2
 
 
 def finish(summary, options, command) -> int:

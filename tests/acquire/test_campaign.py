@@ -1,0 +1,120 @@
+"""A campaign over a study file: every kind of drive, checks, repeats, what is there is kept; and refusals before anything moves."""
+
+import json
+
+import numpy as np
+import pytest
+
+from magjax.acquire import protocol as p
+from magjax.acquire.campaign import SETTINGS, Campaign, entries, read_plan
+from magjax.acquire.device import Device
+from magjax.acquire.log import Log
+from magjax.acquire.response import PlainResponse
+from magjax.bench import load_bench
+from magjax.cli import main
+from magjax.errors import ConfigurationError
+from magjax.recording import load_recordings
+
+STUDY = """
+samples = 200
+periods = 4
+settle = 2
+[[drives]]
+kind = "sine"
+frequency = [20, 100]
+amplitude = 0.5
+offset = 0.1
+[[drives]]
+kind = "multisine"
+frequency = [20, 60]
+amplitude = 0.4
+[[drives]]
+kind = "minor_loops"
+carrier = 100
+modulation = 10
+amplitude = 0.5
+[[drives]]
+kind = "decaying"
+frequency = 50
+amplitude = 0.8
+[[drives]]
+kind = "reversal_curves"
+low = -0.5
+high = 0.5
+count = 4
+rate = 20
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+def test_every_kind_is_recorded_once(emulate, study, tmp_path, capsys):
+    port = emulate("--fast")["port"]
+    assert main(["record", port, "--plan", str(study), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert "6 of 6" in capsys.readouterr().out
+    rows = json.loads((tmp_path / "out" / "campaign.json").read_text())["recordings"]
+    assert [r["tries"] for r in rows] == [1] * 6
+    frequencies = [load_recordings([r["file"]], "aa-050h")[0].frequency() for r in rows[:4]]
+    assert frequencies == pytest.approx([20, 100, 20, 10], rel=1e-5)
+    assert (tmp_path / "out" / "000_sine_20Hz_0.5A.nc").exists()
+    assert all([e for e in Log(r["file"]).events if e["event"] == "demagnetized"] for r in rows)
+    assert main(["record", port, "--plan", str(study), "--out", str(tmp_path / "out"), "--json"]) == 0
+    assert [r["tries"] for r in json.loads(capsys.readouterr().out)["recordings"]] == [0] * 6
+
+
+def test_a_bad_recording_is_repeated(emulate, study, tmp_path):
+    # a reset within the first recording leaves two segments: not fit to use
+    port = emulate("--fault", "reset=80")["port"]
+    said = []
+    made = Campaign(port, load_bench("aa-050h"), tmp_path, 0.9, {**SETTINGS, **read_plan(study).settings}, {}, say=said.append)
+    (row,) = made.run(entries(read_plan(study))[1:2])
+    assert row["status"] == 0 and row["tries"] == 2 and "reset" in " ".join(said)
+    assert len(list(tmp_path.glob("*.bad0.mjlog"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("amplitude = 0.8", "amplitude = 1.8"), "limit is 0.9 A"),
+        (("samples = 200", "sample = 200"), "sample is unknown"),
+        (("samples = 200", 'samples = "many"'), "write it like 500"),
+        (('kind = "decaying"', 'kind = "decayed"'), "is unknown; known are"),
+        (("count = 4", "counts = 4"), "counts is unknown for a reversal_curves"),
+        (("count = 4", ""), "needs count"),
+        (("frequency = [20, 100]", "frequency = [20, 9000]"), "samples a period"),
+        (("[[drives]]", "[[drive"), "not valid TOML"),
+    ],
+)
+def test_a_bad_plan_is_refused_in_one_line(study, tmp_path, capsys, change, words):
+    study.write_text(STUDY.replace(*change))
+    assert main(["record", "/dev/ttyNONE", "--plan", str(study), "--out", str(tmp_path / "out")]) == 2
+    text = capsys.readouterr().err
+    assert words in text and text.count("\n") == 1
+
+
+def test_a_plan_at_a_missing_port_is_status_5(study, tmp_path, capsys):
+    assert main(["record", "/dev/ttyNONE", "--plan", str(study), "--out", str(tmp_path / "out")]) == 5
+    assert "no such port" in capsys.readouterr().err
+    with pytest.raises(ConfigurationError, match="no.such"):
+        read_plan(tmp_path / "no.such")
+
+
+def test_the_device_starts_a_run_once_and_keeps_to_its_limit():
+    device = Device(PlainResponse(exact=True), drive_limit=0.5)
+    ack = p.read_ack(device.receive(p.generate_packet(100, 0, 12000, 0), 0.0)[0])
+    assert ack.status and "allows 0.5 A" in ack.text
+    assert p.read_ack(device.receive(p.generate_packet(100, 0, 9000, 0), 0.0)[0]).status == 0
+    start = p.start_packet(77, 1e4, 1000)
+    first = device.receive(start, 0.0)
+    packets = device.due(0.0, 100, True)
+    assert packets[-1][0] == p.FINAL and p.read_final(packets[-1]).samples == 1000 and device.drive_now() == 0
+    assert device.receive(start, 0.0) == first and device.due(0.0, 100, True) == []
+    device.receive(p.start_packet(78, 1e4, 0), 0.0)
+    device.due(0.1, 1, True)
+    assert device.running and p.read_final(device.due(10.0, 1, True)[0]).reason == 2 and device.drive_now() == 0
+    assert np.array_equal(device.read(0, 4)[:, 0], device.table[:4])
