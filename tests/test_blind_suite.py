@@ -1,18 +1,22 @@
 """The blind proof's own tests: it shares no code with what it tests, its numerics hold, its labels are the sealed ones."""
 
 import ast
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.blind.baselines import correlation, sparse, stepwise
 from tests.blind.cases import SEALS, SUITES, make_case, plan, recordings_of, seal, size, write_case
 from tests.blind.generator.bench import ConcealedBench
 from tests.blind.generator.coil import shell_matrix
 from tests.blind.generator.density import KINDS, SPAN, PlayDensity
 from tests.blind.generator.instruments import record
 from tests.blind.generator.strain import settled_play
+from tests.blind.oracle import Sight
+from tests.blind.run import diagnose
 from tests.blind.score import judge, wilson
 from tests.blind.strengths import GROUPS, HIDDEN, OUTSIDE, VISIBLE
 
@@ -145,3 +149,46 @@ def test_scorer():
     assert judge(case, None, 3) == "data_problem" and judge(case, None, 1) == "failed"
     low, high = wilson(40, 40)
     assert 0.91 < low < 0.92 and high > 0.999
+
+
+@pytest.fixture(scope="module")
+def sight():
+    case = next(make_case("dev", k) for k in range(size("dev")) if plan("dev")[k][0] == "null")
+    return Sight(dataclasses.replace(case, drives=(case.drives[0], case.drives[4], case.drives[8])))
+
+
+def test_oracle_sees_noise_as_noise(sight):
+    noise = np.random.default_rng(0).normal(size=len(sight.sigma))
+    assert abs(sight.z(noise) ** 2 / len(noise) - 1) < 0.1
+
+
+def test_oracle_is_blind_to_what_the_base_can_be(sight):
+    shifted = dataclasses.replace(sight.case, truth={**sight.case.truth, "R_eddy": 1.005 * sight.case.truth["R_eddy"]})
+    other = Sight(shifted)
+    trace = np.tile(other.base - sight.base, (1, 4)).ravel() / sight.sigma
+    assert sight.z(trace) < 0.05 * np.linalg.norm(trace)
+    drift = sight.trace({"zero_drift": 3e-7})
+    assert sight.z(drift) > 0.2 * np.linalg.norm(drift)
+
+
+def test_baselines_choose(sight):
+    rng = np.random.default_rng(0)
+    S = rng.normal(size=(400, 4))
+    e = 3 * S[:, 2] + rng.normal(size=400)
+    names = ["a", "b", "c", "d"]
+    assert "c" in stepwise(e, S, names) and correlation(e, S, names) == {"c"} and "c" in sparse(e, S, names)
+    assert correlation(rng.normal(size=400), S, names) == set()
+
+
+def test_sample_through_the_command_line(tmp_path):
+    """Five recordings of a null, as the runner does it; the whole suites are long."""
+    number = next(k for k in range(size("dev")) if plan("dev")[k][0] == "null" and not make_case("dev", k).instruments["rate"])
+    case = make_case("dev", number)
+    case = dataclasses.replace(
+        case, drives=case.drives[::2], checks=case.checks[1:2], instruments={**case.instruments, "samples": 250}
+    )
+    write_case(case, tmp_path)
+    ended = diagnose(tmp_path, tmp_path / "result", 300.0)
+    assert ended["status"] == 0, ended["last"]
+    said = json.loads((tmp_path / "result" / "diagnosis.json").read_text())
+    assert judge(case, said) == "right", said["message"]

@@ -3,7 +3,8 @@
 Outcomes. right: exactly what is concealed is named, nothing else (nulls: silence; outside: unknown_at; data: data_problem or a
 refusal). group: the truth stands in a group and nothing foreign is named. kin: another member of the truth's known group is named
 alone. extra: the truth and something foreign. partly: one of two. silent: nothing is claimed. unknown: unknown_at. wrong: the rest.
-Shares carry Wilson intervals of 95 %.
+Shares carry Wilson intervals of 95 %. Where ORACLE.json holds a single's z (what one who
+knows the law could see), a second table tells by it.
 """
 
 import argparse
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from .cases import SUITES, block_outside, make_case, seal, size
+from .oracle import FILE as ORACLE
 from .strengths import GROUPS
 
 ORDER = ("right", "group", "kin", "extra", "partly", "silent", "unknown", "data_problem", "wrong", "failed")
@@ -134,7 +136,32 @@ def table(suite: str, rows) -> str:
     if blocks:
         lines.append(f"unknown_at names the right block in {sum(blocks)} of {len(blocks)}.")
     lines.append(f"Time of one diagnosis, compilation included: median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s.")
-    return "\n".join(lines) + "\n\n" + confusion(rows)
+    return "\n".join([*lines, *_by_sight(rows)]) + "\n\n" + confusion(rows)
+
+
+def _by_sight(rows):
+    """Singles and pairs by what the oracle could see, and the targets of the proof."""
+    seen = json.loads(ORACLE.read_text()) if ORACLE.exists() else {}
+    bands = {"below 5": [], "5 to 10": [], "10 to 30": [], "30 to 100": [], "above 100": []}
+    for case, diagnosis, done in rows:
+        if case.kind == "single" and case.name in seen:
+            z = max(seen[case.name].values())
+            key = next(k for k, top in zip(bands, (5, 10, 30, 100, np.inf), strict=True) if z < top)
+            bands[key].append(judge(case, diagnosis, done["status"]))
+    if not any(bands.values()):
+        return []
+    lines = [
+        "",
+        "| single, oracle z | cases | right | group | kin | silent | other | right or group, 95 % |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for key, got in bands.items():
+        if got:
+            n = [sum(o == w for o in got) for w in ("right", "group", "kin", "silent")]
+            low, high = wilson(n[0] + n[1], len(got))
+            cells = " | ".join(map(str, [*n, len(got) - sum(n)]))
+            lines.append(f"| {key} | {len(got)} | {cells} | {n[0] + n[1]}/{len(got)}: {low:.0%} to {high:.0%} |")
+    return lines
 
 
 def confusion(rows) -> str:
