@@ -48,3 +48,12 @@ def test_public_things_are_documented(path):
 def test_the_command_line_starts_without_jax():
     code = "import sys; from magjax.cli import main; main(['--help']); assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+def test_the_page_of_effects_is_up_to_date():
+    from magjax.effects import CATALOGUE
+    from magjax.effects.page import page
+
+    written = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    assert written == page(), "run python -m magjax.effects.page"
+    assert all(f"## {e.name}" in written for e in CATALOGUE)
