@@ -163,3 +163,12 @@ def test_constants_within_their_errors_at_forty_seeds(bench, seed):
     got = fit([record(truth, *d, rng, str(d[0])) for d in drives], bench)
     assert all(abs(got.estimate(n).value - v) < 4 * got.estimate(n).stderr for n, v in TRUE.items())
     jax.clear_caches()
+
+
+def test_a_bias_freed_with_a_prior_comes_back(recordings, bench):
+    """H_bias shifts with the density, so it is free only with a prior; R_eddy does not care."""
+    stated = dataclasses.replace(bench, priors={"coil.H_bias": 60.0})
+    got = fit(recordings, stated, extra=("coil.H_bias",), choices=QUICK, refine=False)
+    bias, resistance = got.estimate("coil.H_bias"), got.estimate("coil.R_eddy")
+    assert got.chi2_per_sample < 1.3 and abs(bias.value - 1.23e4) < 4 * bias.stderr < 400
+    assert abs(resistance.value / 62 - 1) < 0.02
