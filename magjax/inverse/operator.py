@@ -150,7 +150,6 @@ class PlainPreisach:
             if (reached >= target) if rising else (reached <= target):
                 v = self._within(start, stop, cell, base, m_base, rising, target, slope)
                 self._advance(v, rising, base, m_base)
-                self._plateau(rising, cell, base)
                 return v
             self._advance(stop, rising, base, m_base, m_stop)
 
@@ -174,6 +173,7 @@ class PlainPreisach:
     def _within(self, start, stop, cell, base, m_base, rising, target, slope):
         """Solve the quadratic of one cell from `start` towards `stop`."""
         c0, c1, c2 = self._quadratic(cell, base, rising)
+        self.unique = c1 != 0.0 or c2 != 0.0  # else a plateau: every field of the cell gives this M
         sign = 1.0 if rising else -1.0
         z = (start - self.levels[cell]) / self.step
         here = slope * start + m_base + sign * 2 * (c0 + c1 * z + c2 * z * z)
@@ -195,10 +195,6 @@ class PlainPreisach:
             self.extrema.append(tip)
         if not rising and len(self.extrema) == 3 and field <= self.extrema[0][0]:
             self.extrema = [(self.low, self.offset - self.total)]
-
-    def _plateau(self, rising, cell, base):
-        _, c1, c2 = self._quadratic(cell, base, rising)
-        self.unique = bool(c1 != 0.0 or c2 != 0.0)
 
     def invert(self, targets, accelerate: bool = False) -> np.ndarray:
         """Fields for a sequence of wanted M, A/m, carrying the memory along; `accelerate`: compiled by numba."""

@@ -177,6 +177,14 @@ def test_lower_bound_stays_below_what_longer_controllers_reach():
         )
 
 
+def test_interpolation_with_few_taps_leaves_room_for_the_rest():
+    """A zero at 0.9: twelve taps see little of it, and the bound must not pretend otherwise."""
+    plant = (np.array([0.9, -1.0]), np.array([1.0, -0.5]))
+    problem = TrackingProblem(plant=plant, r_bar=1.0, w_bar=2.0, u_bar=np.inf, robust=False)
+    short, long = design(problem, taps=12), design(problem, taps=150)
+    assert short.lower <= long.gamma and long.gap < 1e-5
+
+
 def test_no_jax_behind_inversion_and_control():
     root = Path(__file__).resolve().parents[2] / "magjax"
     for path in [*root.glob("control/*.py"), *root.glob("inverse/*.py")]:

@@ -90,12 +90,15 @@ def test_compiled_inversion_is_the_same_walk_and_does_not_drift():
     many = np.clip(rng.uniform(-7.1e5, 7.1e5, 1_000_000), -7e5, 7e5)
     grid = plant_with().operator
     many[:1000] = rng.choice([grid.copy().apply(v) for v in grid.levels], 1000)
-    fields, values, _, excess = invert_many(grid, many)
+    _, values, _, excess = invert_many(grid, many[:-20000])
     assert excess <= 0  # iterations never above n_c + L
-    assert np.abs(values - many).max() < 1e-13 * 7.87e5
-    check = plant_with().operator
-    tail = np.array([check.apply(v) for v in fields])[-20000:]
-    assert np.abs(tail - many[-20000:]).max() < 1e-13 * 7.87e5
+    check = plant_with().operator  # its M are computed afresh from the corners left after 980 000 samples
+    for field, _ in grid.extrema:
+        check.apply(field)
+    fields, late, _, excess = invert_many(grid, many[-20000:])
+    assert excess <= 0
+    assert np.abs(np.concatenate([values, late]) - many).max() < 1e-13 * 7.87e5
+    assert np.abs([check.apply(v) for v in fields] - many[-20000:]).max() < 1e-13 * 7.87e5
 
 
 def test_bounds_hold_and_guard_their_conditions():
