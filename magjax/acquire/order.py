@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import ConfigurationError, DeviceError
 from . import protocol as p
 
-DECAY, DECAY_WIDTH, DECAY_PERIODS = 0.9, 100, 44
+DECAY, DECAY_WIDTH, DECAY_PERIODS = 0.9, 90, 44  # 3960 samples fit a small board
 
 
 @dataclasses.dataclass

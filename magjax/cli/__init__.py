@@ -19,6 +19,7 @@ COMMANDS = {
     "ports": ("magjax.cli.acquire", "serial ports of this machine"),
     "emulate": ("magjax.cli.acquire", "a bench as a device behind a pseudo-terminal or TCP port"),
     "record": ("magjax.cli.acquire", "a crash-safe recording from a device, or a whole plan"),
+    "investigate": ("magjax.cli.investigate", "record, fit, diagnose, record what is asked for, until it is settled"),
 }
 
 

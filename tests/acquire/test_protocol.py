@@ -101,3 +101,22 @@ def test_the_page_and_the_code_agree():
         assert 2 + sum(sizes[w.split()[1]] for w in text.split(",")) == body.size
     for number, reason in p.REASONS.items():
         assert f"{number} {reason.split(':')[0]}" in page
+
+
+def test_the_firmware_sketch_speaks_the_page():
+    text = (ROOT / "firmware" / "magjax_bench" / "magjax_bench.ino").read_text()
+    stated = dict(re.findall(r"\b([A-Z]+) = (0x[0-9a-f]{2})", text))
+    assert {v: int(k, 16) for v, k in stated.items()} == {name: number for number, name in p.NAMES.items() if name != "NOTE"}
+    sizes = {"DRIVE": p.DRIVE_HEAD.size, "GENERATE": p.GENERATE_BODY.size, "START": p.START_BODY.size}
+    for name, size in sizes.items():
+        assert int(re.search(rf"kind == {name} && n >= (\d+)", text).group(1)) == size
+    assert int(re.search(r"sendFrame\(p, (\d+), false\);\n\}\n\n// --- the run", text).group(1)) == p.FINAL_BODY.size
+    hello = re.search(r'"(\{\\"protocol.*?)",\n', text, re.S).group(1)
+    calibration = re.search(r"CALIBRATION =\n(.*?);", text, re.S).group(1)
+    joined = "".join(re.findall(r'"((?:[^"\\]|\\.)*)"', '"' + hello + '"')).replace('\\"', '"')
+    filled = "".join(re.findall(r'"((?:[^"\\]|\\.)*)"', calibration)).replace('\\"', '"')
+    for mark, value in ((r"%08lx", "0a"), (r"%s", "true"), (r"%s", filled)):
+        joined = joined.replace(mark, value, 1)
+    made = json.loads(re.sub(r"%lu|%d", "32", joined))
+    hello = p.read_hello(p.hello_packet(made))
+    assert hello.clock_bits == 32 and [c.column for c in hello.channels] == ["current_A", "displacement_m"] and hello.drive["limit"] < 1
