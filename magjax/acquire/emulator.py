@@ -95,7 +95,7 @@ class PtyLine(Line):
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
-            time.sleep(0.005)  # no host: select returns at once then
+            time.sleep(0.002 if self.out else 0.02)  # no host: select returns at once then
             return b""
 
     def send(self, wire: bytes) -> int:
@@ -203,7 +203,8 @@ class Emulator:
     def step(self) -> None:
         """One turn: read, answer, make the frames that are due, send."""
         now, line, device = time.monotonic(), self.line, self.device
-        line.wait(0.0 if self.fast and device.running and len(line.out) < BUFFER // 2 else 0.002, bool(line.out) and not line.baud)
+        idle = 0.002 if device.running or line.out else 0.02
+        line.wait(0.0 if self.fast and device.running and len(line.out) < BUFFER // 2 else idle, bool(line.out) and not line.baud)
         for payload in self.splitter.feed(line.receive()):
             for answer in device.receive(payload, now):
                 line.offer(self.faults.mangle(encode(answer)), always=True)

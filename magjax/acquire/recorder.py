@@ -61,7 +61,7 @@ class Recorder:
         if order.resume and order.resume_device != self.hello.device:
             raise ConfigurationError(f"{order.path}: recorded from {order.resume_device}, but {self.hello.device} answers; give a new --out")
         self.log = LogWriter(order.path, header, order.durable)
-        ended = Ended("done", 0)
+        ended = Ended("the recorder failed", 6)
         try:
             if order.resume:
                 self.segment = order.resume_from
@@ -70,6 +70,7 @@ class Recorder:
                 self.log.event("amplifier", identity=self.amplifier.set_up())
             self._begin_run()
             self._record()
+            ended = Ended("done", 0)
         except Ended as reached:
             ended = reached
         except DiskFull as error:

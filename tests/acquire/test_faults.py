@@ -155,6 +155,13 @@ def test_ctrl_c_stops_in_order(emulate, order):
     assert drive_now(port) == (0, False)
 
 
+def test_the_duration_limit_ends_it(emulate, order):
+    port = emulate()["port"]
+    end = record(order(port, samples=0, max_s=0.6))
+    assert (end["status"], end["drive_at_zero"]) == (0, "confirmed") and "duration limit" in end["reason"]
+    assert drive_now(port) == (0, False)
+
+
 def test_a_full_disk_ends_the_recording_with_the_drive_at_zero(emulate, order):
     port = emulate("--fast")["port"]
     made = order(port, samples=5_000_000)

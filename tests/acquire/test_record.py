@@ -15,9 +15,11 @@ from conftest import verify
 from magjax.acquire import protocol as p
 from magjax.acquire.adapters import ScpiAmplifier, TextAdapter
 from magjax.acquire.framing import encode
+from magjax.acquire.link import ask_hello, open_port
 from magjax.acquire.log import Log
 from magjax.acquire.order import Order, commanded
 from magjax.acquire.process import record
+from magjax.acquire.recorder import Ended, Recorder
 from magjax.cli import main
 from magjax.errors import ConfigurationError, DeviceError
 from magjax.recording import load_recordings
@@ -225,6 +227,20 @@ def test_a_foreign_device_is_one_line_and_status_5(tmp_path, hello, words):
     assert not (tmp_path / "a.mjlog").exists()
 
 
+def test_a_measured_current_beyond_the_limit_ends_it(tmp_path):
+    recorder = Recorder(Order("x", str(tmp_path / "a.mjlog"), limit_A=0.5), lambda state: None)
+    recorder.hello = p.read_hello(p.hello_packet(HELLO))
+    recorder._guard(np.array([[5400], [-5400]], "<i2"))
+    with pytest.raises(Ended, match="0.56 A where the limit is 0.5 A") as caught:
+        recorder._guard(np.array([[100], [-5600]], "<i2"))
+    assert caught.value.status == 6
+
+
+def test_acquisition_needs_no_jax():
+    code = "import sys, magjax.acquire.process, magjax.acquire.emulator, magjax.acquire.investigation; assert 'jax' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
 def test_bad_input_is_one_line(emulate, tmp_path, capsys):
     out = str(tmp_path / "a.mjlog")
     port = emulate("--fast")["port"]
@@ -241,6 +257,9 @@ def test_bad_input_is_one_line(emulate, tmp_path, capsys):
         done = magjax("record", *arguments)
         assert done.returncode == status, (arguments, done.stderr)
         assert words in done.stderr and len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
+    device = open_port(port)
+    assert ask_hello(device, 3.0).content["drive_now"] == 0 and not list(tmp_path.glob("*.mjlog"))
+    device.close()
     with open(port):
         done = magjax("record", port, "--out", str(tmp_path / "b.mjlog"))
         assert done.returncode == 5 and "in use by process" in done.stderr
