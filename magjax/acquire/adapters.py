@@ -109,7 +109,9 @@ def _text_hello(columns: str) -> p.Hello:
         match = re.fullmatch(rf"({'|'.join(p.SI)})_(\w+)", name)
         unit = match.group(2).replace("_per_", "/") if match else ""
         if not match or unit not in p.SI[match.group(1)]:
-            raise DeviceError(f'text column "{name}" is no quantity with a unit; write for instance seq,t_us,current_mA,displacement_um')
+            raise DeviceError(
+                f'text column "{name}" is no quantity with a unit; write for instance seq,t_us,current_mA,displacement_um'
+            )
         channels.append(p.Channel(match.group(1), unit, 1.0))
     if not channels:
         raise DeviceError("the text columns name no channel; write for instance seq,t_us,current_mA,displacement_um")
@@ -135,7 +137,9 @@ class ScpiAmplifier:
         while time.monotonic() < end and not answer.endswith(b"\n"):
             answer += self.port.read(256)
         if not answer.endswith(b"\n"):
-            raise DeviceError(f"{self.port.name}: the amplifier does not answer {question}; check its address, baud rate and XON/XOFF")
+            raise DeviceError(
+                f"{self.port.name}: the amplifier does not answer {question}; check its address, baud rate and XON/XOFF"
+            )
         return answer.decode("ascii", "replace").strip()
 
     def set_up(self) -> str:

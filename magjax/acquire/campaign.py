@@ -111,18 +111,24 @@ def _entries(row, settings, rate_max):
         grid = [(f, a, o) for f in _list(row["frequency"]) for a in _list(row["amplitude"]) for o in _list(row.get("offset", 0.0))]
         return [sine_entry(*point, settings, rate_max) for point in grid]
     if kind == "multisine":
-        base = waveforms.multisine(_list(row["frequency"]), row["amplitude"], row.get("offset", 0.0), periods=1, samples=20000).frequency
+        base = waveforms.multisine(
+            _list(row["frequency"]), row["amplitude"], row.get("offset", 0.0), periods=1, samples=20000
+        ).frequency
         width = _width(base, settings["samples"] * round(max(_list(row["frequency"])) / base), rate_max)
         drive = waveforms.multisine(_list(row["frequency"]), row["amplitude"], row.get("offset", 0.0), periods=1, samples=width)
         return [_table_entry("multisine", drive, settings)]
     if kind == "minor_loops":
         width = _width(row["modulation"], settings["samples"] * round(row["carrier"] / row["modulation"]), rate_max)
         depth, offset = row.get("depth", 0.6), row.get("offset", 0.0)
-        drive = waveforms.modulated_sine(row["carrier"], row["modulation"], row["amplitude"], depth, offset, periods=1, samples=width)
+        drive = waveforms.modulated_sine(
+            row["carrier"], row["modulation"], row["amplitude"], depth, offset, periods=1, samples=width
+        )
         return [_table_entry("minor_loops", drive, settings)]
     if kind == "decaying":
         width = _width(row["frequency"], settings["samples"], rate_max)
-        drive = waveforms.decaying(row["frequency"], row["amplitude"], row.get("offset", 0.0), decay=row.get("decay", 0.9), samples=width)
+        drive = waveforms.decaying(
+            row["frequency"], row["amplitude"], row.get("offset", 0.0), decay=row.get("decay", 0.9), samples=width
+        )
     else:
         drive = waveforms.reversal_curves(row["low"], row["high"], row["count"], row["rate"])
     return [_table_entry(kind, drive, settings)]
@@ -131,7 +137,9 @@ def _entries(row, settings, rate_max):
 def _width(frequency, wanted, rate_max):
     width = int(min(wanted, rate_max / frequency, 60000))
     if width < FEWEST:
-        raise ConfigurationError(f"{frequency:g} Hz leaves {width} samples a period at {rate_max:g} samples/s; {FEWEST} are needed: lower the frequency")
+        raise ConfigurationError(
+            f"{frequency:g} Hz leaves {width} samples a period at {rate_max:g} samples/s; {FEWEST} are needed: lower the frequency"
+        )
     return width
 
 
@@ -219,14 +227,28 @@ class Campaign:
             )  # fmt: skip
             end = record(order, self.live)
             if end["status"] in (5, 130) or end["state"] == "refused":
-                return {"name": entry.name, "file": str(path), "status": end["status"], "problems": [end["reason"]], "tries": attempt, "text": entry.text}
+                return {
+                    "name": entry.name,
+                    "file": str(path),
+                    "status": end["status"],
+                    "problems": [end["reason"]],
+                    "tries": attempt,
+                    "text": entry.text,
+                }
             problems = self.problems(path, entry) if end["status"] == 0 else [end["reason"]]
             if not problems:
                 export_log(path, path.with_suffix(".nc"))
                 break
             self.say(f"  try {attempt} is not fit to use: {problems[0]}")
             settle = 2 * settle if any("transient" in text or "drift" in text for text in problems) else settle
-        return {"name": entry.name, "file": str(path), "status": 3 if problems else 0, "problems": problems, "tries": attempt, "text": entry.text}
+        return {
+            "name": entry.name,
+            "file": str(path),
+            "status": 3 if problems else 0,
+            "problems": problems,
+            "tries": attempt,
+            "text": entry.text,
+        }
 
     def problems(self, path, entry: Entry) -> list[str]:
         """Why a recording is not fit to use; empty where it is."""
@@ -247,5 +269,7 @@ class Campaign:
         current = recording.channels.get("current")
         wanted = np.ptp(np.asarray(entry.drive["values"])) if entry.drive["kind"] == "table" else 2 * entry.drive["amplitude"]
         if current is not None and not 0.5 * wanted < np.ptp(current) < 1.5 * wanted:
-            found.append(f"the current spans {np.ptp(current):.3g} A where {wanted:.3g} A were commanded; check amplifier and shunt")
+            found.append(
+                f"the current spans {np.ptp(current):.3g} A where {wanted:.3g} A were commanded; check amplifier and shunt"
+            )
         return found

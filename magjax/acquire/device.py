@@ -24,7 +24,9 @@ class Device:
         self.rate_max, self.frame_samples, self.watchdog_s, self.drive_limit = rate_max, frame_samples, watchdog_s, drive_limit
         self.first_seq, self.clock_us, self.clock_bits = first_seq, clock_us, clock_bits
         self.speed_up = 1 + 1e-6 * drift_ppm
-        self.noise = np.array([c.get("noise", 0.0) / (c["scale"] * p.SI[c["name"]][c["unit"]]) for c in response.channels]) * bool(noise)
+        self.noise = np.array([c.get("noise", 0.0) / (c["scale"] * p.SI[c["name"]][c["unit"]]) for c in response.channels]) * bool(
+            noise
+        )
         self.random = np.random.default_rng(seed)
         self.boot(0.0)
 
@@ -40,7 +42,11 @@ class Device:
     def hello(self) -> bytes:
         """HELLO as it stands now."""
         channels = [{k: c[k] for k in ("name", "unit", "scale", "offset")} for c in self.response.channels]
-        last = None if self.last is None else dict(zip(("reason", "run", "last_seq", "frames", "samples", "dropped"), self._last_row(), strict=True))
+        last = (
+            None
+            if self.last is None
+            else dict(zip(("reason", "run", "last_seq", "frames", "samples", "dropped"), self._last_row(), strict=True))
+        )
         return p.hello_packet({
             "protocol": p.VERSION, "device": self.name, "firmware": "magjax emulator 1", "boot_id": self.boot_id, "rate_max_Hz": self.rate_max,
             "frame_samples": self.frame_samples, "clock_bits": self.clock_bits, "watchdog_s": self.watchdog_s, "channels": channels,
@@ -113,7 +119,9 @@ class Device:
 
     def _check(self, counts):
         if len(counts) and np.abs(counts).max() * DRIVE_SCALE > self.drive_limit * (1 + 1e-9):
-            raise ValueError(f"the drive reaches {np.abs(counts).max() * DRIVE_SCALE:.4g} A, the device allows {self.drive_limit:g} A")
+            raise ValueError(
+                f"the drive reaches {np.abs(counts).max() * DRIVE_SCALE:.4g} A, the device allows {self.drive_limit:g} A"
+            )
 
     def _start(self, payload, now):
         _, _, run, rate, samples = p.START_BODY.unpack_from(payload)
@@ -136,7 +144,9 @@ class Device:
         return p.ack_packet(p.START, 0, self.first_seq, text)
 
     def _counts(self, values):
-        rows = [(values[:, k] / p.SI[c["name"]][c["unit"]] - c["offset"]) / c["scale"] for k, c in enumerate(self.response.channels)]
+        rows = [
+            (values[:, k] / p.SI[c["name"]][c["unit"]] - c["offset"]) / c["scale"] for k, c in enumerate(self.response.channels)
+        ]
         return np.stack(rows, axis=1)
 
     def read(self, first: int, count: int) -> np.ndarray:
@@ -182,5 +192,7 @@ class Device:
     def finish(self, reason: int) -> bytes:
         """End the run, drive to zero; FINAL."""
         self.running = False
-        self.last = p.Final(reason, self.run or 0, (self.first_seq + self.frames - 1) & 0xFFFFFFFF, self.frames, self.samples, self.dropped)
+        self.last = p.Final(
+            reason, self.run or 0, (self.first_seq + self.frames - 1) & 0xFFFFFFFF, self.frames, self.samples, self.dropped
+        )
         return p.final_packet(self.last)

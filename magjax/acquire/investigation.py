@@ -40,9 +40,13 @@ class Investigation:
             try:
                 self.state = json.loads(self.path.read_text(encoding="utf-8"))
             except ValueError as error:
-                raise ConfigurationError(f"{self.path}: cannot be read ({error}); remove it to begin anew, the recordings are kept") from None
+                raise ConfigurationError(
+                    f"{self.path}: cannot be read ({error}); remove it to begin anew, the recordings are kept"
+                ) from None
             if self.state["bench"] != campaign.bench.name:
-                raise ConfigurationError(f"{self.path} is about bench {self.state['bench']}; give another --out for {campaign.bench.name}")
+                raise ConfigurationError(
+                    f"{self.path} is about bench {self.state['bench']}; give another --out for {campaign.bench.name}"
+                )
 
     def run(self) -> dict:
         """Go on until it is settled or the budget is spent; the content of investigation.json."""
@@ -58,7 +62,9 @@ class Investigation:
             stopped = next((r for r in rows if r["status"] in (5, 130)), None)
             if stopped:
                 return self._end("interrupted" if stopped["status"] == 130 else "device", stopped["problems"][0])
-            step = self._step([files[e.name] for e in [*first, *extra] if e.name in files], [files[e.name] for e in checks if e.name in files])
+            step = self._step(
+                [files[e.name] for e in [*first, *extra] if e.name in files], [files[e.name] for e in checks if e.name in files]
+            )
             self.state["spent_s"] = before + self.clock() - begin
             if step["settled"]:
                 return self._end("settled", step["message"])
@@ -67,7 +73,9 @@ class Investigation:
                 return self._end("budget spent", f"{step['message']} The budget is spent: {spent}.")
             drive = self._next_drive(step)
             if drive is None:
-                return self._end("nothing left to try", f"{step['message']} No further experiment within the limits is left to try.")
+                return self._end(
+                    "nothing left to try", f"{step['message']} No further experiment within the limits is left to try."
+                )
             self.state["extra"].append(drive)
             step["asked_for"] = f"{drive[1]:.3g} A at {drive[0]:g} Hz about {drive[2]:.3g} A"
             self.campaign.say(f"next experiment: {step['asked_for']}")
@@ -106,7 +114,13 @@ class Investigation:
         self.campaign.say(f"diagnosis {number + 1}: {len(files)} recordings, {len(checks)} checks")
         content = self.analyse(files, checks, number)
         source = check_source([*files, *checks])
-        step = {"files": key, "checks": [Path(f).name for f in checks], "diagnosis": f"diagnosis_{number + 1}", "source": source, **judge(content, source)}
+        step = {
+            "files": key,
+            "checks": [Path(f).name for f in checks],
+            "diagnosis": f"diagnosis_{number + 1}",
+            "source": source,
+            **judge(content, source),
+        }
         step["next_experiment"] = content.get("next_experiment")
         self.state["steps"].append(step)
         self._save()
@@ -121,7 +135,9 @@ class Investigation:
         done += [(f, a * self._limit, o * self._limit) for f, a, o in STUDY] if self.plan is None else []
         for f, a, o in menu:
             a = min(a, self._limit - abs(o))
-            near = any(abs(f / g - 1) < 0.02 and abs(a - b) < 0.05 * self._limit and abs(o - c) < 0.05 * self._limit for g, b, c in done)
+            near = any(
+                abs(f / g - 1) < 0.02 and abs(a - b) < 0.05 * self._limit and abs(o - c) < 0.05 * self._limit for g, b, c in done
+            )
             if a > 0 and not near and f * 40 <= self.rate_max:
                 return [float(f), float(round(a, 4)), float(round(o, 4))]
         return None
@@ -146,7 +162,16 @@ def judge(content: dict, source: dict | None) -> dict:
     if source and source["verdict"] == "amplifier_lag":
         tau = {"value": source["tau"], "stderr": source["stderr"], "unit": "s"}
         names = [Path(d["file"]).name for d in source["decided_by"][:3]]
-        effects.append({"name": "amplifier_lag", "block": "source", "parameters": {"tau": tau}, "confidence": 0.99, "shifts": {}, "decided_by": names})
+        effects.append(
+            {
+                "name": "amplifier_lag",
+                "block": "source",
+                "parameters": {"tau": tau},
+                "confidence": 0.99,
+                "shifts": {},
+                "decided_by": names,
+            }
+        )
         message += f" The measured current lags its command by {1e6 * tau['value']:.3g} us as a first-order amplifier does: amplifier_lag (source)."
         verdict = "attributed" if verdict == "nothing_missing" else verdict
     elif source and source["verdict"] != "follows":
@@ -157,14 +182,22 @@ def judge(content: dict, source: dict | None) -> dict:
         message += " The check recordings are not foretold to three times their noise."
     for effect in effects:
         message += f" {effect['name']} was decided by {', '.join(effect['decided_by'])}."
-    return {"verdict": verdict, "effects": effects, "groups": content["groups"], "settled": verdict in SETTLED and foretold, "message": message}
+    return {
+        "verdict": verdict,
+        "effects": effects,
+        "groups": content["groups"],
+        "settled": verdict in SETTLED and foretold,
+        "message": message,
+    }
 
 
 def deciders(content: dict) -> list[str]:
     """The recordings whose misfit falls most by the repair, most first, until nine tenths of the fall are named."""
     base, repaired = content.get("base") or {}, content.get("repaired") or {}
     before = {Path(r["file"]).name: r["chi2_per_sample"] for r in base.get("recordings", [])}
-    fall = {Path(r["file"]).name: before.get(Path(r["file"]).name, 0.0) - r["chi2_per_sample"] for r in repaired.get("recordings", [])}
+    fall = {
+        Path(r["file"]).name: before.get(Path(r["file"]).name, 0.0) - r["chi2_per_sample"] for r in repaired.get("recordings", [])
+    }
     total, named, share = sum(max(v, 0.0) for v in fall.values()), [], 0.0
     for name, value in sorted(fall.items(), key=lambda pair: -pair[1]):
         if share >= 0.9 * total or value <= 0:
@@ -187,10 +220,14 @@ def page(state: dict) -> str:
         rows.append(f'<p><a href="{step["diagnosis"]}/report.html">diagnosis</a> of {say(", ".join(step["files"]))}</p>')
         if step["source"]:
             s = step["source"]
-            rows.append(f"<p>Source by command and shunt: {say(s['verdict'])}, tau = {s['tau']:.4g} s (standard error {s['stderr']:.2g} s).</p>")
+            rows.append(
+                f"<p>Source by command and shunt: {say(s['verdict'])}, tau = {s['tau']:.4g} s (standard error {s['stderr']:.2g} s).</p>"
+            )
         if "asked_for" in step:
             rows.append(f"<p>Next experiment: {say(step['asked_for'])}</p>")
     rows.append("<h2>Recordings</h2><table><tr><th>name<th>drive<th>tries<th>verdict</tr>")
     for r in state.get("recordings", []):
-        rows.append(f"<tr><td>{say(r['name'])}<td>{say(r['text'])}<td>{r['tries']}<td>{say('; '.join(r['problems']) or 'good')}</tr>")
+        rows.append(
+            f"<tr><td>{say(r['name'])}<td>{say(r['text'])}<td>{r['tries']}<td>{say('; '.join(r['problems']) or 'good')}</tr>"
+        )
     return "\n".join([*rows, "</table></html>"])

@@ -62,7 +62,9 @@ def list_ports() -> list[dict]:
     """Serial ports of this machine: name, description, identity."""
     from serial.tools import list_ports as tools
 
-    return [{"port": c.device, "description": c.description, "identity": c.serial_number or c.hwid} for c in sorted(tools.comports())]
+    return [
+        {"port": c.device, "description": c.description, "identity": c.serial_number or c.hwid} for c in sorted(tools.comports())
+    ]
 
 
 def candidates(name: str) -> list[str]:
@@ -93,7 +95,9 @@ def ask_hello(port, wait: float, splitter=None) -> p.Hello:
             if payload[0] == p.ACK and payload[2] == p.QUERY:
                 raise DeviceError(f"the device refuses the handshake: {p.read_ack(payload).text}; load the matching firmware")
     heard = f"{splitter.received} bytes came, none of them a frame of the protocol" if splitter.received else "nothing came"
-    raise DeviceError(f"{port.name}: no HELLO within {wait:g} s ({heard}); check the port, the baud rate and the firmware (docs/protocol.md)")
+    raise DeviceError(
+        f"{port.name}: no HELLO within {wait:g} s ({heard}); check the port, the baud rate and the firmware (docs/protocol.md)"
+    )
 
 
 def writable(path) -> None:

@@ -88,17 +88,25 @@ class Order:
         if self.text is not None:
             return
         if hello.rate_max and self.rate > hello.rate_max:
-            raise ConfigurationError(f"{self.rate:g} samples/s are asked for, the device makes {hello.rate_max:g}; take fewer samples a period")
+            raise ConfigurationError(
+                f"{self.rate:g} samples/s are asked for, the device makes {hello.rate_max:g}; take fewer samples a period"
+            )
         if self.drive is None:
             return
         if not hello.drive:
-            raise DeviceError(f"{hello.device} has no drive output; record without a drive (--no-drive) and drive the coil otherwise")
+            raise DeviceError(
+                f"{hello.device} has no drive output; record without a drive (--no-drive) and drive the coil otherwise"
+            )
         self.scale, self.rate_max = float(hello.drive["scale"]), hello.rate_max
         if self.peak() > float(hello.drive["limit"]) * (1 + 1e-9):
-            raise ConfigurationError(f"the drive reaches {self.peak():.4g} A, the device allows {hello.drive['limit']:g} A; lower it")
+            raise ConfigurationError(
+                f"the drive reaches {self.peak():.4g} A, the device allows {hello.drive['limit']:g} A; lower it"
+            )
         room = int(hello.drive["table"])
         if self.drive["kind"] == "table" and len(self.drive["values"]) > room:
-            raise ConfigurationError(f"the drive has {len(self.drive['values'])} samples, the device holds {room}; take fewer samples a period")
+            raise ConfigurationError(
+                f"the drive has {len(self.drive['values'])} samples, the device holds {room}; take fewer samples a period"
+            )
 
     def _counts(self):
         return np.round(np.asarray(self.drive["values"]) / self.scale).astype("<i2")
@@ -128,7 +136,13 @@ class Order:
         if drive["kind"] == "table":
             return {"command": {"scale": self.scale, "repeats": drive["repeats"], "counts": self._counts().tolist()}}
         amplitude, offset = round(drive["amplitude"] / self.scale), round(drive["offset"] / self.scale)
-        row = {"scale": self.scale, "repeats": drive["periods"], "samples": drive["samples"], "amplitude": amplitude, "offset": offset}
+        row = {
+            "scale": self.scale,
+            "repeats": drive["periods"],
+            "samples": drive["samples"],
+            "amplitude": amplitude,
+            "offset": offset,
+        }
         return {"command": {**row, "factor": drive["factor"]}}
 
 

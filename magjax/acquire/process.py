@@ -71,7 +71,9 @@ def record(order: Order, progress=None) -> dict:
     `progress(dict)` is called a few times a second. Ctrl-C ends the recording in order and is reported as status 130.
     """
     command = [sys.executable, "-m", "magjax.acquire.process"]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+    child = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    )
     last = None
     with child:
         child.stdin.write(order.to_json() + "\n")
@@ -93,7 +95,12 @@ def record(order: Order, progress=None) -> dict:
             else:
                 last = content
     if last is None:
-        return {"state": "ended", "status": 6, "reason": f"the recorder died; {order.path} holds what was acknowledged", "path": order.path}
+        return {
+            "state": "ended",
+            "status": 6,
+            "reason": f"the recorder died; {order.path} holds what was acknowledged",
+            "path": order.path,
+        }
     return last
 
 

@@ -91,7 +91,9 @@ def read_hello(payload: bytes) -> Hello:
     try:
         content = json.loads(payload[2:])
         if content["protocol"] != VERSION:
-            raise DeviceError(f"the device speaks protocol version {content['protocol']}, magjax speaks {VERSION}; load the matching firmware")
+            raise DeviceError(
+                f"the device speaks protocol version {content['protocol']}, magjax speaks {VERSION}; load the matching firmware"
+            )
         channels = tuple(_channel(c) for c in content["channels"])
         hello = Hello(
             str(content["device"]), str(content["firmware"]), str(content["boot_id"]), float(content["rate_max_Hz"]),
@@ -99,7 +101,9 @@ def read_hello(payload: bytes) -> Hello:
             float(content.get("watchdog_s", 0.0)), bool(content.get("running", False)), content.get("last"), content,
         )  # fmt: skip
     except (ValueError, TypeError) as error:
-        raise DeviceError(f"the device's HELLO cannot be read ({error}); it is not a magjax device, or its firmware is damaged") from None
+        raise DeviceError(
+            f"the device's HELLO cannot be read ({error}); it is not a magjax device, or its firmware is damaged"
+        ) from None
     except KeyError as error:
         raise DeviceError(f"the device's HELLO lacks {error}; see docs/protocol.md") from None
     if not channels or hello.frame_samples < 1:
@@ -174,7 +178,9 @@ class Final:
 
 def final_packet(final: Final) -> bytes:
     """FINAL."""
-    return FINAL_BODY.pack(FINAL, VERSION, final.reason, final.run, final.last_seq & 0xFFFFFFFF, final.frames, final.samples, final.dropped)
+    return FINAL_BODY.pack(
+        FINAL, VERSION, final.reason, final.run, final.last_seq & 0xFFFFFFFF, final.frames, final.samples, final.dropped
+    )
 
 
 def read_final(payload: bytes) -> Final:
@@ -186,7 +192,8 @@ def drive_packets(counts, repeats: int) -> list[bytes]:
     """DRIVE packets that upload a table of counts (i16); the device plays it `repeats` times (0: until STOP)."""
     counts = np.ascontiguousarray(counts, "<i2")
     return [
-        DRIVE_HEAD.pack(DRIVE, VERSION, k, len(counts), repeats) + counts[k : k + DRIVE_CHUNK].tobytes() for k in range(0, len(counts), DRIVE_CHUNK)
+        DRIVE_HEAD.pack(DRIVE, VERSION, k, len(counts), repeats) + counts[k : k + DRIVE_CHUNK].tobytes()
+        for k in range(0, len(counts), DRIVE_CHUNK)
     ]
 
 

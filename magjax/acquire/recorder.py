@@ -59,7 +59,9 @@ class Recorder:
             self.amplifier = ScpiAmplifier(order.amplifier, order.limit_A)
         header = None if order.resume else order.header | self._device_header()
         if order.resume and order.resume_device != self.hello.device:
-            raise ConfigurationError(f"{order.path}: recorded from {order.resume_device}, but {self.hello.device} answers; give a new --out")
+            raise ConfigurationError(
+                f"{order.path}: recorded from {order.resume_device}, but {self.hello.device} answers; give a new --out"
+            )
         self.log = LogWriter(order.path, header, order.durable)
         ended = Ended("the recorder failed", 6)
         try:
@@ -93,7 +95,9 @@ class Recorder:
             while self.adapter.hello is None and time.monotonic() < end:
                 held += self.adapter.feed(quick_read(self.port))
             if self.adapter.hello is None:
-                raise DeviceError(f"{self.order.port}: no line # seq,t_us,... within {self.order.boot_wait_s:g} s; name the columns with --text COLUMNS")
+                raise DeviceError(
+                    f"{self.order.port}: no line # seq,t_us,... within {self.order.boot_wait_s:g} s; name the columns with --text COLUMNS"
+                )
             self.hello = self.adapter.hello
         self.adapter.channels = len(self.hello.channels)
 
@@ -126,7 +130,9 @@ class Recorder:
         rate = float(json.loads(answer.text or "{}").get("rate_Hz", order.rate))
         self.tracker = Tracker(rate, answer.value, self.hello.frame_samples, self.hello.clock_bits)
         self.run_number = run
-        self.log.event("start", segment=self.segment, rate_Hz=rate, run=run, boot_id=self.hello.boot_id, **order.about, **order.command())
+        self.log.event(
+            "start", segment=self.segment, rate_Hz=rate, run=run, boot_id=self.hello.boot_id, **order.about, **order.command()
+        )
         self.quiet_since = time.monotonic()
         for kind, value in backlog:
             self._take(kind, value)

@@ -47,7 +47,9 @@ class BenchResponse:
         for name, parameters in hidden.items():
             self.actuator = self.actuator.with_effect(effect_of(name, parameters))
         if self.actuator.output != "displacement":
-            raise ConfigurationError(f"bench {bench.name} ends at {self.actuator.output}; the emulator needs one that ends at displacement")
+            raise ConfigurationError(
+                f"bench {bench.name} ends at {self.actuator.output}; the emulator needs one that ends at displacement"
+            )
         self.channels = converter(displacement_noise, current_noise)
         self.shift = shift
 

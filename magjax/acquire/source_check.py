@@ -79,4 +79,9 @@ def _fit(model, w, gain, error):
     covariance = np.linalg.inv(result.jac.T @ result.jac)
     chi2 = float(2 * result.cost)
     widen = np.sqrt(max(chi2 / max(2 * len(w) - 2, 1), 1.0))
-    return {"tau": float(result.x[1] * scale), "stderr": float(np.sqrt(covariance[1, 1]) * scale * widen), "gain": float(result.x[0]), "chi2": chi2}
+    return {
+        "tau": float(result.x[1] * scale),
+        "stderr": float(np.sqrt(covariance[1, 1]) * scale * widen),
+        "gain": float(result.x[0]),
+        "chi2": chi2,
+    }

@@ -26,7 +26,10 @@ def run_ports(arguments) -> int:
     if options.json:
         print(json.dumps(found))
     else:
-        print("\n".join(f"{c['port']:24s} {c['description']:32s} {c['identity']}" for c in found) or "no serial port found; is the device plugged in?")
+        print(
+            "\n".join(f"{c['port']:24s} {c['description']:32s} {c['identity']}" for c in found)
+            or "no serial port found; is the device plugged in?"
+        )
     return 0
 
 
@@ -41,7 +44,9 @@ def _hidden(words) -> dict:
             try:
                 found[name][key] = float(value)
             except ValueError:
-                raise ConfigurationError(f'--hide "{word}": write EFFECT:PARAMETER=VALUE, for instance sensor_lag:tau=1e-4') from None
+                raise ConfigurationError(
+                    f'--hide "{word}": write EFFECT:PARAMETER=VALUE, for instance sensor_lag:tau=1e-4'
+                ) from None
     return found
 
 
@@ -49,9 +54,19 @@ def run_emulate(arguments) -> int:
     """magjax emulate."""
     p = parser("emulate", "A bench as a real device on a pseudo-terminal or TCP port: the model, with concealed effects, noise, counts and faults.",
                "magjax emulate --bench aa-050h --hide sensor_lag:tau=1e-4 --fault drop=1e-5")  # fmt: skip
-    p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name; plain: no physics, for trying the link")
-    p.add_argument("--hide", action="append", default=[], metavar="EFFECT[:NAME=VALUE,...]", help="conceal an effect of the catalogue (again for more)")
-    p.add_argument("--as-stated", action="store_true", help="keep the bench file's constants and density instead of inventing others")
+    p.add_argument(
+        "--bench", default="aa-050h", help="bench file (TOML) or a built-in name; plain: no physics, for trying the link"
+    )
+    p.add_argument(
+        "--hide",
+        action="append",
+        default=[],
+        metavar="EFFECT[:NAME=VALUE,...]",
+        help="conceal an effect of the catalogue (again for more)",
+    )
+    p.add_argument(
+        "--as-stated", action="store_true", help="keep the bench file's constants and density instead of inventing others"
+    )
     p.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE",
                    help="drop, flip, merge, duplicate (probabilities), zeros, reset, stall, unplug, wrap, drift, shift, at")  # fmt: skip
     p.add_argument("--tcp", type=int, metavar="PORT", help="listen on this TCP port (0: a free one) instead of a pseudo-terminal")
@@ -60,7 +75,9 @@ def run_emulate(arguments) -> int:
     p.add_argument("--baud", type=float, help="pace the line: bits a second (ten a byte)")
     p.add_argument("--rate-max", type=float, default=2e5, help="fastest sampling, Hz (default 200000)")
     p.add_argument("--frame", type=int, default=64, help="samples a frame (default 64)")
-    p.add_argument("--watchdog", type=float, default=2.0, help="s of the host's silence after which the drive goes to zero (default 2)")
+    p.add_argument(
+        "--watchdog", type=float, default=2.0, help="s of the host's silence after which the drive goes to zero (default 2)"
+    )
     p.add_argument("--exact", action="store_true", help="no noise")
     options = p.parse_args(arguments)
     return _emulate(options)
@@ -78,7 +95,9 @@ def _emulate(options) -> int:
                     watchdog_s=options.watchdog, drive_limit=limit, drift_ppm=faults.drift, noise=not options.exact, seed=options.seed,
                     **wrapping)  # fmt: skip
     line = TcpLine(options.tcp, options.baud) if options.tcp is not None else PtyLine(options.link, options.baud)
-    text = json.dumps({"port": line.name, "device": device.name}) if options.json else f"{device.name} at {line.name}; Ctrl-C ends it"
+    text = (
+        json.dumps({"port": line.name, "device": device.name}) if options.json else f"{device.name} at {line.name}; Ctrl-C ends it"
+    )
     print(text, flush=True)
     import signal
 
@@ -148,7 +167,13 @@ def run_record(arguments) -> int:
     p.add_argument("--seconds", type=float, help="duration limit, s")
     p.add_argument("--no-drive", action="store_true", help="record only")
     p.add_argument("--rate", type=float, help="samples/s with --no-drive")
-    p.add_argument("--text", nargs="?", const="", metavar="COLUMNS", help="text-line device; COLUMNS such as seq,t_us,current_mA,displacement_um")
+    p.add_argument(
+        "--text",
+        nargs="?",
+        const="",
+        metavar="COLUMNS",
+        help="text-line device; COLUMNS such as seq,t_us,current_mA,displacement_um",
+    )
     p.add_argument("--amplifier", metavar="PORT", help="set up a SCPI amplifier there, and switch it off at the end")
     p.add_argument("--resume", action="store_true", help="append to a log that exists")
     p.add_argument("--export", help="write the recording to this file, too (.nc, .csv, .mat, .parquet)")
@@ -230,7 +255,14 @@ def _sine(order, options):
         raise ConfigurationError("give --frequency above zero, --samples of 16 or more, --periods and --settle of zero or more")
     order.rate = options.frequency * options.samples
     order.samples, order.settle_samples = options.periods * options.samples, options.settle * options.samples
-    order.drive = {"kind": "sine", "samples": options.samples, "periods": 0, "amplitude": options.amplitude, "offset": options.offset, "factor": 1.0}
+    order.drive = {
+        "kind": "sine",
+        "samples": options.samples,
+        "periods": 0,
+        "amplitude": options.amplitude,
+        "offset": options.offset,
+        "factor": 1.0,
+    }
     drive = f"sine {options.frequency:g} Hz, {options.amplitude:g} A about {options.offset:g} A"
     order.about = {"frequency_Hz": options.frequency, "settle_samples": order.settle_samples, "drive": drive}
     order.loop_samples = options.samples

@@ -26,10 +26,14 @@ def run(_command: str, arguments: list[str]) -> int:
     plan = read_plan(options.plan) if options.plan else None
     quiet = options.quiet or options.json
     with Live(quiet) as live:
-        made = campaign(options, arguments, "investigate", live, lambda text: None if quiet else print(text, file=sys.stderr, flush=True))
+        made = campaign(
+            options, arguments, "investigate", live, lambda text: None if quiet else print(text, file=sys.stderr, flush=True)
+        )
         if plan is not None:
             made.settings = plan.settings
-        state = Investigation(made, analysis(made.bench, made.folder, options), Budget(options.recordings, options.minutes), plan).run()
+        state = Investigation(
+            made, analysis(made.bench, made.folder, options), Budget(options.recordings, options.minutes), plan
+        ).run()
     ended = state["ended"]
     if options.json:
         print(json.dumps(state))
@@ -59,7 +63,9 @@ def analysis(bench, folder, options):
             found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
         content = found.as_dict()
         place = output_folder(folder / f"diagnosis_{number + 1}")
-        write_diagnosis(place, found, recordings, content, f"magjax diagnose {' '.join(str(f) for f in files)} --bench {options.bench}")
+        write_diagnosis(
+            place, found, recordings, content, f"magjax diagnose {' '.join(str(f) for f in files)} --bench {options.bench}"
+        )
         return json.loads(json.dumps(content))
 
     return analyse

@@ -21,8 +21,20 @@ def emulate():
     started = []
 
     def start(*options, bench="plain"):
-        command = [sys.executable, "-m", "magjax", "emulate", "--json", "--bench", bench, *(["--exact"] if bench == "plain" else []), *options]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+        command = [
+            sys.executable,
+            "-m",
+            "magjax",
+            "emulate",
+            "--json",
+            "--bench",
+            bench,
+            *(["--exact"] if bench == "plain" else []),
+            *options,
+        ]
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        )
         started.append(process)
         line = process.stdout.readline()
         assert line, process.stderr.read()
@@ -42,7 +54,14 @@ def order(tmp_path):
 
     def make(port, **changes):
         drive = {"kind": "table", "values": (RAMP * SCALE).tolist(), "repeats": 0}
-        given = {"rate": 50e3, "samples": 100_000, "drive": drive, "start_wait_s": 5.0, "give_up_s": 5.0, "header": {"bench": "plain"}}
+        given = {
+            "rate": 50e3,
+            "samples": 100_000,
+            "drive": drive,
+            "start_wait_s": 5.0,
+            "give_up_s": 5.0,
+            "header": {"bench": "plain"},
+        }
         return Order(port, str(tmp_path / "run.mjlog"), **{**given, **changes})
 
     return make

@@ -54,7 +54,10 @@ def test_clean_run_over_a_pty_and_tcp(emulate, order):
         assert drive_now(port) == (0, False)
 
 
-@pytest.mark.parametrize("faults", [("drop=2e-5",), ("flip=2e-5",), ("merge=0.02", "duplicate=0.05"), ("zeros=200000",), ("drop=3e-5", "flip=3e-5", "merge=0.01")])
+@pytest.mark.parametrize(
+    "faults",
+    [("drop=2e-5",), ("flip=2e-5",), ("merge=0.02", "duplicate=0.05"), ("zeros=200000",), ("drop=3e-5", "flip=3e-5", "merge=0.01")],
+)
 def test_damage_on_the_line_is_counted_exactly(emulate, order, faults):
     words = [w for f in faults for w in ("--fault", f)]
     port = emulate("--fast", "--seed", "3", *words)["port"]
@@ -223,7 +226,21 @@ def test_a_killed_recording_is_resumed(emulate, order, tmp_path):
     assert kill_at(made, 2.0) > 0
     with open(made.path, "ab") as stream:
         stream.write(b"MJL1 torn")
-    command = [sys.executable, "-m", "magjax", "record", port, "--out", made.path, "--resume", "--frequency", "100", "--samples", "100", "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "magjax",
+        "record",
+        port,
+        "--out",
+        made.path,
+        "--resume",
+        "--frequency",
+        "100",
+        "--samples",
+        "100",
+        "--json",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     log = Log(made.path)

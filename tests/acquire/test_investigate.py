@@ -59,7 +59,9 @@ def test_records_what_the_diagnosis_asks_for_and_goes_on_where_it_ended(emulate,
 def test_a_budget_of_minutes_ends_it(emulate, tmp_path):
     analyse, asked = scripted("group", "group")
     clock = iter(np.arange(100) * 100.0)
-    state = Investigation(campaign(emulate("--fast")["port"], tmp_path), analyse, Budget(20, 1), PLAN, clock=lambda: next(clock)).run()
+    state = Investigation(
+        campaign(emulate("--fast")["port"], tmp_path), analyse, Budget(20, 1), PLAN, clock=lambda: next(clock)
+    ).run()
     assert state["ended"]["how"] == "budget spent" and len(asked) == 1
 
 
@@ -101,7 +103,15 @@ def test_the_source_is_judged_by_command_and_shunt(tmp_path, answer, verdict):
 
 def test_who_decided_and_what_both_say_together():
     rows = lambda *chi2: {"recordings": [{"file": f"a/r{k}.mjlog", "chi2_per_sample": c} for k, c in enumerate(chi2)]}
-    content = {"verdict": "nothing_missing", "message": "nothing.", "effects": [], "groups": [], "check": [], "base": rows(2, 30, 1), "repaired": rows(1, 1, 1)}
+    content = {
+        "verdict": "nothing_missing",
+        "message": "nothing.",
+        "effects": [],
+        "groups": [],
+        "check": [],
+        "base": rows(2, 30, 1),
+        "repaired": rows(1, 1, 1),
+    }
     assert deciders(content) == ["r1.mjlog"]
     source = {"verdict": "amplifier_lag", "tau": 5e-5, "stderr": 1e-7, "decided_by": [{"file": "a/r1.mjlog"}]}
     said = judge(content, source)
@@ -114,7 +124,18 @@ def test_who_decided_and_what_both_say_together():
 def test_names_a_concealed_sensor_filter_and_amplifier_lag(emulate, tmp_path):
     hidden = ["--hide", "sensor_lag:tau=1e-4,order2=0.5", "--hide", "amplifier_lag:tau=5e-5"]
     port = emulate("--fast", *hidden, bench="aa-050h")["port"]
-    command = [sys.executable, "-m", "magjax", "investigate", port, "--bench", "aa-050h", "--out", str(tmp_path / "study"), "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "magjax",
+        "investigate",
+        port,
+        "--bench",
+        "aa-050h",
+        "--out",
+        str(tmp_path / "study"),
+        "--json",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr
     ended = json.loads(done.stdout)["ended"]

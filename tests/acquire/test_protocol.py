@@ -119,4 +119,8 @@ def test_the_firmware_sketch_speaks_the_page():
         joined = joined.replace(mark, value, 1)
     made = json.loads(re.sub(r"%lu|%d", "32", joined))
     hello = p.read_hello(p.hello_packet(made))
-    assert hello.clock_bits == 32 and [c.column for c in hello.channels] == ["current_A", "displacement_m"] and hello.drive["limit"] < 1
+    assert (
+        hello.clock_bits == 32
+        and [c.column for c in hello.channels] == ["current_A", "displacement_m"]
+        and hello.drive["limit"] < 1
+    )

@@ -81,7 +81,21 @@ def test_no_loss_at_two_megabaud(emulate, order):
 def test_record_and_fit_what_it_wrote(emulate, tmp_path):
     port = emulate("--fast", "--fault", "drift=100")["port"]
     log, table = tmp_path / "a.mjlog", tmp_path / "a.nc"
-    done = magjax("record", port, "--frequency", "50", "--amplitude", "0.4", "--offset", "0.1", "--out", str(log), "--export", str(table), "--json")
+    done = magjax(
+        "record",
+        port,
+        "--frequency",
+        "50",
+        "--amplitude",
+        "0.4",
+        "--offset",
+        "0.1",
+        "--out",
+        str(log),
+        "--export",
+        str(table),
+        "--json",
+    )
     assert done.returncode == 0, done.stderr
     end = json.loads(done.stdout)
     assert end["lost"] == 0 and end["received"] == 12 * 500 and end["exported"] == [str(table)]
@@ -89,7 +103,11 @@ def test_record_and_fit_what_it_wrote(emulate, tmp_path):
         (recording,) = load_recordings([path], "aa-050h")
         about = recording.origin["metadata"]
         assert recording.frequency() == pytest.approx(50) and recording.n_samples == 8 * 500
-        assert about["device"] == "emulated plain 0" and about["command_line"].startswith("magjax record ") and about["current"] == "measured"
+        assert (
+            about["device"] == "emulated plain 0"
+            and about["command_line"].startswith("magjax record ")
+            and about["current"] == "measured"
+        )
     import xarray as xr
 
     with xr.open_dataset(table, engine="h5netcdf") as data:
@@ -163,7 +181,11 @@ def test_a_text_line_device_is_recorded(tmp_path):
     def print_lines():
         k = 0
         while not stop.wait(0.005):
-            rows = b"".join(f"{j},{j * 100},{500 * np.sin(j / 20):.3f},{50 + 10 * np.sin(j / 20):.3f}\n".encode() for j in range(k, k + 50) if j % 997)
+            rows = b"".join(
+                f"{j},{j * 100},{500 * np.sin(j / 20):.3f},{50 + 10 * np.sin(j / 20):.3f}\n".encode()
+                for j in range(k, k + 50)
+                if j % 997
+            )
             with contextlib.suppress(BlockingIOError):  # nobody reads any more
                 os.write(master, (b"# seq,t_us,current_mA,displacement_um\n" if k % 1000 == 0 else b"") + rows)
             k += 50
@@ -221,7 +243,11 @@ HELLO = {
 )
 def test_a_foreign_device_is_one_line_and_status_5(tmp_path, hello, words):
     far = FakeDevice(lambda chunk: encode(hello) if hello else b"garbage")
-    end = record(Order(far.name_of_port, str(tmp_path / "a.mjlog"), drive={"kind": "table", "values": [0.1] * 9, "repeats": 0}, boot_wait_s=1.0))
+    end = record(
+        Order(
+            far.name_of_port, str(tmp_path / "a.mjlog"), drive={"kind": "table", "values": [0.1] * 9, "repeats": 0}, boot_wait_s=1.0
+        )
+    )
     far.end()
     assert end["status"] == 5 and words in end["reason"] and "\n" not in end["reason"]
     assert not (tmp_path / "a.mjlog").exists()
@@ -237,7 +263,9 @@ def test_a_measured_current_beyond_the_limit_ends_it(tmp_path):
 
 
 def test_acquisition_needs_no_jax():
-    code = "import sys, magjax.acquire.process, magjax.acquire.emulator, magjax.acquire.investigation; assert 'jax' not in sys.modules"
+    code = (
+        "import sys, magjax.acquire.process, magjax.acquire.emulator, magjax.acquire.investigation; assert 'jax' not in sys.modules"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 
@@ -263,7 +291,12 @@ def test_bad_input_is_one_line(emulate, tmp_path, capsys):
     with open(port):
         done = magjax("record", port, "--out", str(tmp_path / "b.mjlog"))
         assert done.returncode == 5 and "in use by process" in done.stderr
-    for arguments in (["--fault", "flood=3"], ["--hide", "gremlin"], ["--hide", "sensor_lag:tau=much"], ["--bench", "plain", "--hide", "sensor_lag"]):
+    for arguments in (
+        ["--fault", "flood=3"],
+        ["--hide", "gremlin"],
+        ["--hide", "sensor_lag:tau=much"],
+        ["--bench", "plain", "--hide", "sensor_lag"],
+    ):
         assert main(["emulate", *arguments]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert main(["ports", "--json"]) == 0
