@@ -48,8 +48,9 @@ def judge(case, diagnosis, status=0) -> str:
     truth = set(case.effects)
     if verdict == "data_problem":
         return "right" if case.kind == "data" else "data_problem"
-    if case.kind == "data":
-        return "silent" if not named | grouped else "wrong"
+    if case.kind == "data":  # a few missing rows may be mended and the rest believed
+        mended = case.instruments["fault"] == "missing" and verdict in QUIET
+        return "right" if mended else "silent" if not named | grouped else "wrong"
     if case.kind == "outside":
         return "right" if verdict == "unknown_at" else "silent" if verdict in QUIET else "wrong"
     if case.kind in ("null", "decoy"):
