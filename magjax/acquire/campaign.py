@@ -199,12 +199,12 @@ class Campaign:
     def run(self, found) -> list[dict]:
         """Record every entry that is not there yet; a row each: name, file, status, problems, tries. Stops at status 5 and 130."""
         self.check_limits(found)
-        rows = []
+        rows, place = [], self.folder / "campaign.json"
         for k, entry in enumerate(found):
             self.say(f"{k + 1} of {len(found)}: {entry.text}")
             row = self.one(entry)
             rows.append(row)
-            (self.folder / "campaign.json").write_text(json.dumps({"recordings": rows}, indent=1))
+            place.write_text(json.dumps({"recordings": rows}, indent=1))
             if row["status"] in (5, 130):
                 break
         return rows
