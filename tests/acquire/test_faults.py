@@ -121,6 +121,17 @@ def test_a_stall_is_told_and_its_losses_counted(emulate, order):
     verify(made.path)
 
 
+def test_a_lost_tail_is_counted(emulate, order):
+    # the last 60 of 782 frames fall into a silence: no sequence number shows them, only the device's own count
+    port = emulate("--fault", "stall=1.5", "--fault", "at=720")["port"]
+    made = order(port, samples=50_000)
+    end = record(made)
+    assert end["status"] == 0 and end["received"] + end["lost"] == end["sent"] == 50_000
+    in_gaps = sum(e["samples"] for e in events(made.path, "gap"))
+    assert end["lost"] - in_gaps > 1000
+    verify(made.path)
+
+
 def test_unplugged_and_back_under_another_name(emulate, order, tmp_path):
     port = emulate("--link", str(tmp_path / "ttyEMU"), "--fault", "unplug=0.7")["port"]
     made = order(port, samples=120_000)
