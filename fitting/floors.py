@@ -118,6 +118,14 @@ def remove_record_effect(recordings, effect, output):
 
 def data_problem(recordings, spectra, output) -> str | None:
     """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
+    shortest = min(range(len(spectra)), key=lambda k: spectra[k].samples * spectra[k].dt)
+    for number, (recording, s) in enumerate(zip(recordings, spectra, strict=True)):
+        y = np.asarray(recording.channels[output])[: s.samples]
+        if number == shortest and s.periods >= 2 and (change := _period_change(s, y)) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
+            return (
+                f"{recording.name}: the periods do not repeat: the last differs from the first by {change:.3g} rms within "
+                f"{s.samples * s.dt * 1e3:.3g} ms, too fast for a drift; wait until the reading is settled, then record"
+            )
     for recording, s in zip(recordings, spectra, strict=True):
         y = np.asarray(recording.channels[output])[: s.samples]
         if s.periods >= 2:
@@ -136,6 +144,14 @@ def data_problem(recordings, spectra, output) -> str | None:
             if moved > 0.05 * s.peak_to_peak and moved > 8 * floor:
                 return f"{recording.name}: the reading drifts by {moved:.3g} through the record; let it warm up, or remove the drift first"
     return None
+
+
+def _period_change(s, y) -> float:
+    """Rms of the last period less the first."""
+    step = int(s.samples / s.periods)
+    cycles = np.arange(s.samples) * s.dt * s.frequency
+    first, last = (np.interp(k + np.arange(step) / step, cycles, y) for k in (0, s.periods - 1))
+    return float(np.sqrt(np.mean((first - last) ** 2)))
 
 
 def wrong_bench(result) -> str | None:

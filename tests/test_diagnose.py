@@ -83,3 +83,19 @@ def test_quasistatic_loops_claim_no_rate_effect(measured):
     found = diagnose(load_recordings([measured / "ferrite_mnzn" / "loops.csv"], bench), bench, choices=Choices(max_jacobians=12))
     static = {"mean_field", "reversible_magnetization", "accommodation", "sensor_nonlinearity"}
     assert {e["name"] for e in found.effects} | {n for g in found.groups for n in g} <= static
+
+
+def test_periods_that_do_not_repeat_are_a_data_problem():
+    """A slowly decaying start that is alike in every recording, however short: no drift does that."""
+    bench = load_bench("aa-050h")
+    rng = np.random.default_rng(0)
+    for size, wrong in ((0.04, True), (0.0, False)):
+        recordings = []
+        for f in (10.0, 100.0, 300.0):
+            t = np.arange(2000) / (500 * f)
+            wave = np.sin(2 * np.pi * f * t)
+            y = 3e-5 + 2e-5 * wave * (1 + size * 2 * np.linspace(1, 0, 2000)) + 40e-9 * rng.standard_normal(2000)
+            y = y + (2e-6 * t if not wrong else 0)  # a real drift is no data problem
+            recordings.append(Recording(t, {"current": 0.5 * wave, "displacement": y}, {}, {}, f"{f} Hz"))
+        found = data_problem(recordings, spectra_of(recordings, bench), "displacement")
+        assert (found is not None and "do not repeat" in found) == wrong

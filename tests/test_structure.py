@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-NUMPY_ONLY = ("magjax/inverse", "magjax/recording.py", "magjax/readers.py", "magjax/writers.py", "magjax/inspection.py", "magjax/waveforms.py", "magjax/bench.py")
+NUMPY_ONLY = ("magjax/control", "magjax/inverse", "magjax/pickup.py", "magjax/recording.py", "magjax/readers.py", "magjax/writers.py", "magjax/inspection.py", "magjax/waveforms.py", "magjax/bench.py")
 SOURCES = sorted([*ROOT.glob("magjax/**/*.py"), *ROOT.glob("fitting/**/*.py")])
 
 

@@ -30,7 +30,7 @@ def usage() -> str:
         "Usage: magjax COMMAND [OPTIONS]\n\nSimulate, fit and diagnose hysteretic magnetostrictive actuators.\n\n"
         f"Commands (magjax COMMAND --help explains each):\n{rows}\n\n"
         "Start with: magjax demo\n"
-        "Exit status: 0 done; 2 wrong use; 3 recording unusable; 4 done but not to be trusted; 130 interrupted."
+        "Exit status: 0 done; 2 wrong use; 3 recording unusable; 4 done but not to be trusted;\n  5 device or port; 6 recording ended early but intact; 130 interrupted."
     )
 
 
