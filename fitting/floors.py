@@ -118,14 +118,6 @@ def remove_record_effect(recordings, effect, output):
 
 def data_problem(recordings, spectra, output) -> str | None:
     """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
-    shortest = min(range(len(spectra)), key=lambda k: spectra[k].samples * spectra[k].dt)
-    for number, (recording, s) in enumerate(zip(recordings, spectra, strict=True)):
-        y = np.asarray(recording.channels[output])[: s.samples]
-        if number == shortest and s.periods >= 2 and (change := _period_change(s, y)) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
-            return (
-                f"{recording.name}: the periods do not repeat: the last differs from the first by {change:.3g} rms within "
-                f"{s.samples * s.dt * 1e3:.3g} ms, too fast for a drift; wait until the reading is settled, then record"
-            )
     for recording, s in zip(recordings, spectra, strict=True):
         y = np.asarray(recording.channels[output])[: s.samples]
         if s.periods >= 2:
@@ -143,6 +135,13 @@ def data_problem(recordings, spectra, output) -> str | None:
             moved = float(np.abs(blocks[-1].mean() - blocks[0].mean()))
             if moved > 0.05 * s.peak_to_peak and moved > 8 * floor:
                 return f"{recording.name}: the reading drifts by {moved:.3g} through the record; let it warm up, or remove the drift first"
+    recording, s = min(zip(recordings, spectra, strict=True), key=lambda pair: pair[1].samples * pair[1].dt)
+    y = np.asarray(recording.channels[output])[: s.samples]
+    if s.periods >= 2 and (change := _period_change(s, y)) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
+        return (
+            f"{recording.name}: the periods do not repeat: the last differs from the first by {change:.3g} rms within "
+            f"{s.samples * s.dt * 1e3:.3g} ms, too fast for a drift; wait until the reading is settled, then record"
+        )
     return None
 
 

@@ -199,7 +199,7 @@ def test_a_full_disk_ends_the_recording_with_the_drive_at_zero(emulate, order):
     end = rest(child)
     assert child.returncode == 6 and "run.mjlog" in end["reason"] and end["drive_at_zero"] == "confirmed"
     log = verify(made.path)
-    assert log.samples == end["acknowledged"] > 50_000 and not log.damage
+    assert log.samples == end["acknowledged"] > 1_000 and not log.damage  # a chunk that no longer fits is lost as a whole
     assert drive_now(port) == (0, False)
 
 

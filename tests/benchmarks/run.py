@@ -128,6 +128,20 @@ def static():
     return found
 
 
+def memory():
+    """Peak memory of value and gradient where the field is known, T = 1e6, MB: grown over that of a short path."""
+    from magjax.preisach.static import static_path, static_value_and_gradient
+
+    h = actuator_at(100).hysteresis
+    found = {}
+    for T in (1000, 1_000_000):
+        field = 1.2e4 + 1.1e4 * np.sin(np.arange(T) * 0.02)
+        run = static_value_and_gradient(lambda M: jnp.sum(M**2), h.low, h.high, h.offset, static_path(field, -2e3))
+        jax.block_until_ready(run(h.masses))
+        found[T] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"T = 1e6: peak memory grown by, MB (bar < 500)": found[1_000_000] - found[1000]}
+
+
 def grid():
     """200 x 20 sweep to steady state against the same with the compiled serial loop."""
     actuator = actuator_at()
@@ -176,7 +190,7 @@ def l1():
     return {"l1 design at 40 taps, s (bar < 0.3)": best(design, 3)}
 
 
-GROUPS = {"single": single, "batch": batch, "derivatives": derivatives, "static": static, "sweep": grid, "inversion": inversion, "l1": l1}
+GROUPS = {"single": single, "batch": batch, "derivatives": derivatives, "static": static, "memory": memory, "sweep": grid, "inversion": inversion, "l1": l1}
 
 
 def main():
