@@ -274,7 +274,10 @@ def test_stop_is_answered_twice_alike(emulate):
     port = open_port(emulate("--fast")["port"])
     ask_hello(port, 3.0)
     port.write(encode(bare_packet(STOP)) * 2)
-    time.sleep(0.3)
-    first, second, _ = port.read(200).split(b"\0")
+    heard, until = b"", time.monotonic() + 20.0
+    while heard.count(b"\0") < 2 and time.monotonic() < until:
+        heard += port.read(200)
+        time.sleep(0.01)
+    first, second, _ = heard.split(b"\0")
     assert first == second
     port.close()
