@@ -34,14 +34,20 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     begin = time.perf_counter()
     spectra = spectra_of(recordings, bench, choices.harmonics)
     names = free_parameters(bench, actuator, extra)
-    report = (lambda *a: None) if progress is None else progress
+    history = []
+
+    def report(text, step=0, chi2=None):
+        history.append((text, int(step), None if chi2 is None else float(chi2)))
+        if progress is not None:
+            progress(text, step, chi2)
+
     problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), start)
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report)
     if refine and choices.knots is not None:
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report)
-    return finish(problem, solution, choices, bench, recordings, warm)
+    return dataclasses.replace(finish(problem, solution, choices, bench, recordings, warm), history=tuple(history))
 
 
 RESTS = {"negative_saturation": "negative", "demagnetized": "demagnetized", "positive_saturation": "positive"}

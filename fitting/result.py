@@ -45,6 +45,7 @@ class FitResult:
     refined: object = dataclasses.field(repr=False, default=None)
     spectra: tuple = dataclasses.field(repr=False, default=())
     choices: object = dataclasses.field(repr=False, default=None)
+    history: tuple = dataclasses.field(repr=False, default=())  # (stage, Jacobian, chi2/N) of every step taken
 
     def estimate(self, name: str):
         """The estimate of one parameter by name."""
@@ -72,8 +73,8 @@ class FitResult:
             "recordings": [dataclasses.asdict(r) for r in self.recordings],
             "parameters": {
                 e.name: {
-                    "value": e.value, "stderr": e.stderr, "unit": e.unit, "free": e.free, "start": e.start,
-                    "at_bound": e.at_bound, "identified": e.identified,
+                    "value": e.value, "stderr": e.stderr, "unit": e.unit, "meaning": e.meaning, "free": e.free,
+                    "start": e.start, "at_bound": e.at_bound, "identified": e.identified,
                 }
                 for e in self.estimates
             },
@@ -81,6 +82,9 @@ class FitResult:
             "levels": int(self.actuator.hysteresis.cells),
             "chi2_per_sample": self.chi2_per_sample,
             "bic": self.bic,
+            "data_count": int(self.data_count),
+            "effective_unknowns": float(self.unknowns),
+            "history": [list(step) for step in self.history],
             "jacobians": self.jacobians,
             "compile_s": self.compile_s,
             "solve_s": self.solve_s,
