@@ -13,9 +13,9 @@ from ..param import param
 class Magnetostriction(eqx.Module):
     """The quadratic law of T&B (5)."""
 
-    lambda_s: Float[Array, ""] = param(1.313e-3, "1", "saturation magnetostriction", low=0.0)
-    M_s: Float[Array, ""] = param(7.87e5, "A/m", "saturation magnetization", low=0.0)
-    l_rod: Float[Array, ""] = param(5.13e-2, "m", "length of the rod", low=0.0)
+    lambda_s: Float[Array, ""] = param(1.313e-3, "1", "saturation magnetostriction", low=0.0, typical=(2e-5, 2e-3))
+    M_s: Float[Array, ""] = param(7.87e5, "A/m", "saturation magnetization", low=0.0, typical=(3e5, 2e6))
+    l_rod: Float[Array, ""] = param(5.13e-2, "m", "length of the rod", low=0.0, typical=(5e-3, 0.3))
 
     @property
     def reach(self):

@@ -16,8 +16,8 @@ from ..param import param
 class Mechanics(eqx.Module):
     """One damped mode, T&B (5)."""
 
-    f0: Float[Array, ""] = param(392.0, "Hz", "first resonance frequency", low=0.0)
-    xi: Float[Array, ""] = param(0.7783, "1", "damping ratio", low=0.0)
+    f0: Float[Array, ""] = param(392.0, "Hz", "first resonance frequency", low=0.0, typical=(50.0, 2e4))
+    xi: Float[Array, ""] = param(0.7783, "1", "damping ratio", low=0.0, typical=(0.01, 1.5))
 
     def response(self, s):
         """G(s) = w0^2 / (s^2 + 2 xi w0 s + w0^2), unit gain at rest."""

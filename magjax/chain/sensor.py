@@ -12,7 +12,7 @@ from ..param import param
 class Sensor(eqx.Module):
     """A sensor that reads the quantity plus an offset."""
 
-    offset: Float[Array, ""] = param(0.0, "reading", "zero of the sensor", scale=1e-5)
+    offset: Float[Array, ""] = param(0.0, "reading", "zero of the sensor", scale=1e-5, typical=(-1e-4, 1e-4))
 
     def __call__(self, quantity):
         """The reading."""

@@ -25,7 +25,7 @@ COMMANDS = {
 
 def usage() -> str:
     """The text of `magjax --help`."""
-    rows = "\n".join(f"  {name:10s} {text}" for name, (_, text) in COMMANDS.items())
+    rows = "\n".join(f"  {name:11s} {text}" for name, (_, text) in COMMANDS.items())
     return (
         "Usage: magjax COMMAND [OPTIONS]\n\nSimulate, fit and diagnose hysteretic magnetostrictive actuators.\n\n"
         f"Commands (magjax COMMAND --help explains each):\n{rows}\n\n"

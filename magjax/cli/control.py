@@ -20,14 +20,13 @@ def run(command: str, arguments: list[str]) -> int:
     """Run one of the commands of this module."""
     if command == "invert":
         return run_invert(arguments)
-    actions = {"design": run_design, "bounds": run_bounds, "simulate": run_simulate, "compare": run_compare}
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0
-    if arguments[0] not in actions:
-        print(f'magjax control: no action "{arguments[0]}"; give one of {", ".join(actions)}', file=sys.stderr)
+    if arguments[0] not in ACTIONS:
+        print(f'magjax control: no action "{arguments[0]}"; give one of {", ".join(ACTIONS)}', file=sys.stderr)
         return 2
-    return actions[arguments[0]](arguments[1:])
+    return ACTIONS[arguments[0]](arguments[1:])
 
 
 def run_invert(arguments) -> int:
@@ -150,3 +149,6 @@ def run_compare(arguments) -> int:
         summary = compare_summary(_plant(options), options, folder, None if options.hide == "none" else benches)
     print(json.dumps(summary) if options.json else summary["message"])
     return 0
+
+
+ACTIONS = {"design": run_design, "bounds": run_bounds, "simulate": run_simulate, "compare": run_compare}

@@ -1,8 +1,8 @@
-"""`python -m magjax.effects.page`: the page of all effects, docs/effects.md, from what each file says of itself."""
+"""`python -m magjax.effects.page [--check]`: the page of all effects, docs/effects.md, from what each file says of itself."""
 
 import sys
-from pathlib import Path
 
+from ..page import deliver
 from . import CATALOGUE
 
 
@@ -25,12 +25,10 @@ def page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def main():
-    """Write docs/effects.md beside the package, or where the first argument says."""
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "docs" / "effects.md"
-    target.write_text(page(), encoding="utf-8")
-    print(target)
+def main(arguments=None) -> int:
+    """Write docs/effects.md, or with --check say whether it is up to date."""
+    return deliver("effects.md", page(), "magjax.effects.page", arguments)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
