@@ -4,7 +4,6 @@ Current (A) or applied field (A/m) in, every signal of the chain out, SI. Period
 """
 
 import dataclasses
-import functools
 
 import equinox as eqx
 import jax
@@ -17,6 +16,8 @@ from .chain.coupled import magnetize
 from .constants import MU0
 from .errors import ConfigurationError
 from .preisach.memory import nesting
+from .scale import Chunk, Job, run_job
+from .scale.devices import over_devices
 
 
 class Signals(eqx.Module):
@@ -143,12 +144,16 @@ def _refuse_outside(actuator, signals):
         )
 
 
-def sweep(actuator, frequencies, amplitudes, offsets=(0.0,), *, samples: int = 250, settle: int = 2, chunk: int = 512, keep=False):
+def sweep(
+    actuator, frequencies, amplitudes, offsets=(0.0,), *, samples: int = 250, settle: int = 2, chunk: int = 512, keep=False,
+    executor=None, checkpoint=None, progress=None,
+):  # fmt: skip
     """Steady states for a grid of biased sines, as a labelled xarray Dataset.
 
     `frequencies` Hz, `amplitudes` and `offsets` in the unit of the drive. Returns peak-to-peak and mean reading,
     amplitude and phase of its fundamental, and loss per cycle; `keep=True` adds the waveforms. The grid is run in
-    chunks of `chunk` trajectories, so memory does not grow with it.
+    chunks of `chunk` trajectories, so memory does not grow with it, each over the devices that JAX sees; `executor`,
+    `checkpoint` and `progress` as in `magjax.scale.run_job`: the numbers are the same to the last bit for any of them.
     """
     import xarray as xr
 
@@ -158,15 +163,14 @@ def sweep(actuator, frequencies, amplitudes, offsets=(0.0,), *, samples: int = 2
     shape = tuple(len(x) for x in axes)
     start = actuator.hysteresis.history.shape[0] // 2
     corners = int(4 * np.ceil((4 + start) / 4))
-    run = functools.partial(_sweep_chunk, samples=samples, periods=settle + 1, corners=corners, keep=keep)
-    parts = []
     total = len(grid[0])
     chunk = min(chunk, total)
+    chunks = []
     for begin in range(0, total, chunk):
-        index = np.minimum(np.arange(begin, begin + chunk), total - 1)
-        part = run(actuator, *(jnp.asarray(x[index]) for x in grid))
-        count = min(chunk, total - begin)
-        parts.append({k: np.asarray(v)[:count] for k, v in part.items()})
+        index = np.arange(begin, min(begin + chunk, total))
+        chunks.append(Chunk(f"{begin}-{begin + len(index) - 1}", [x[index] for x in grid]))
+    inputs = {"actuator": actuator, "chunk": chunk, "samples": samples, "periods": settle + 1, "corners": corners, "keep": keep}
+    parts = run_job(Job("sweep", _sweep_part, inputs, tuple(chunks)), executor, checkpoint=checkpoint, progress=progress).results
     columns = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
     dims = ("frequency", "amplitude", "offset")
     data = {}
@@ -184,6 +188,15 @@ def sweep(actuator, frequencies, amplitudes, offsets=(0.0,), *, samples: int = 2
     result["loss"].attrs["units"] = "J/m^3"
     result["frequency"].attrs["units"] = "Hz"
     return result
+
+
+def _sweep_part(inputs, points, rng):
+    """One chunk of a sweep, filled up by its last point to the common size so that all run the same program."""
+    count = len(points[0])
+    full = [np.append(x, np.full(inputs["chunk"] - count, x[-1])) for x in points]
+    options = {k: inputs[k] for k in ("samples", "periods", "corners", "keep")}
+    found = over_devices(_sweep_chunk, inputs["actuator"], full, **options)
+    return {k: np.asarray(v)[:count] for k, v in found.items()}
 
 
 @eqx.filter_jit

@@ -1,0 +1,191 @@
+"""Where chunks run: this process, a pool of processes, any concurrent.futures executor, dask.distributed.
+
+An engine's `run` yields (chunk id, encoded result) as chunks finish, in any order; `lost` counts workers that died.
+"""
+
+import concurrent.futures
+import contextlib
+import hashlib
+import multiprocessing
+import os
+import signal
+import uuid
+from collections import Counter, deque
+from concurrent.futures.process import BrokenProcessPool
+
+from ..errors import ConfigurationError
+from .worker import begin, pack, perform_opened, perform_packed
+
+TRIES = 3  # workers that one chunk may cost
+KINDS = '"processes:N", "dask:ADDRESS", a dask.distributed Client or a concurrent.futures Executor'
+
+
+def engine(executor):
+    """The engine that an `executor=` argument names. Raises `ConfigurationError` for what is none."""
+    if executor is None:
+        return InProcess()
+    if isinstance(executor, str):
+        kind, _, rest = executor.partition(":")
+        if kind == "processes" and rest.isdecimal() and int(rest) > 0:
+            return Processes(int(rest))
+        if kind == "dask" and rest:
+            return Dask(rest)
+        raise ConfigurationError(f'executor "{executor}" is unknown; give None, {KINDS}')
+    if isinstance(executor, concurrent.futures.Executor):
+        return Foreign(executor)
+    if hasattr(executor, "scheduler_info") and hasattr(executor, "submit"):
+        return Dask(executor)
+    raise ConfigurationError(f"executor of type {type(executor).__name__} is unknown; give None, {KINDS}")
+
+
+def _given_up(name, chunk, words):
+    return ConfigurationError(
+        f"{name}: chunk {chunk} {words}; the chunks before it are in the checkpoint, if one was given: give each worker more memory "
+        "(fewer --workers), then resume"
+    )
+
+
+class InProcess:
+    """One chunk after the other, here."""
+
+    lost = 0
+
+    def run(self, name, work, inputs, tasks):
+        """See the module."""
+        from .job import perform
+
+        for chunk, item, entropy in tasks:
+            yield chunk, perform(work, inputs, item, entropy)
+
+
+class Processes:
+    """`count` fresh processes (spawned: JAX does not survive a fork), one pool of one process each.
+
+    A pool breaks as a whole when a process of it dies; with one process a pool the death of a worker costs the chunk that it
+    was at and no other, and the chunk is known. The chunk is given to a fresh process, three times at most.
+    """
+
+    def __init__(self, count: int):
+        self.count, self.lost = count, 0
+        self._alive: dict[object, int] = {}
+
+    def run(self, name, work, inputs, tasks):
+        """See the module."""
+        blob = pack(inputs)
+        key = hashlib.sha256(blob).hexdigest()
+        waiting, cost, running = deque(tasks), Counter(), {}
+        idle = [None] * min(self.count, len(tasks))
+        try:
+            while waiting or running:
+                while waiting and idle:
+                    pool = idle.pop() or self._fresh()
+                    first = pool not in self._alive
+                    task = waiting.popleft()
+                    opened = pool.submit(begin, key, blob) if first else None
+                    running[pool.submit(perform_opened, work, key, *task[1:])] = (pool, task, opened)
+                done, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+                for future in done:
+                    pool, task, opened = running.pop(future)
+                    try:
+                        if opened is not None:
+                            self._alive[pool] = opened.result()
+                        result = future.result()
+                    except BrokenProcessPool:
+                        self._alive.pop(pool, None)
+                        pool.shutdown(wait=False)
+                        pool = None
+                        cost[task[0]] += 1
+                        self.lost += 1
+                        if cost[task[0]] == TRIES:
+                            words = f"ended its worker {TRIES} times (killed, out of memory, or the script lacks its `if __name__ == \"__main__\":`)"
+                            raise _given_up(name, task[0], words) from None
+                        waiting.appendleft(task)
+                    else:
+                        yield task[0], result
+                    idle.append(pool)
+        finally:
+            for pool in idle:
+                if pool is not None:
+                    pool.shutdown()
+            for pool, _, _ in running.values():  # left early: a busy worker would finish its chunk for nobody
+                pool.shutdown(wait=False, cancel_futures=True)
+                if pool in self._alive:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(self._alive[pool], signal.SIGTERM)
+
+    def _fresh(self):
+        return concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+
+
+class Foreign:
+    """A concurrent.futures executor that the caller made and keeps (threads, processes, MPI)."""
+
+    lost = 0
+
+    def __init__(self, executor):
+        self.executor = executor
+
+    def run(self, name, work, inputs, tasks):
+        """See the module."""
+        blob = pack(inputs)
+        key = hashlib.sha256(blob).hexdigest()
+        running = {self.executor.submit(perform_packed, work, key, blob, item, entropy): chunk for chunk, item, entropy in tasks}
+        try:
+            for future in concurrent.futures.as_completed(running):
+                try:
+                    result = future.result()
+                except concurrent.futures.BrokenExecutor:
+                    words = 'was with an executor whose worker died; give executor="processes:N", which replaces workers'
+                    raise _given_up(name, running[future], words) from None
+                yield running[future], result
+        finally:
+            for future in running:
+                future.cancel()
+
+
+class Dask:
+    """A dask.distributed cluster, by address or by client. The scheduler gives a dead worker's chunk to another.
+
+    The inputs are the result of a task, so that the scheduler can make them again where their only holder died.
+    """
+
+    lost = 0
+
+    def __init__(self, where):
+        try:
+            import distributed
+        except ImportError:
+            raise ConfigurationError('a dask scheduler needs dask.distributed; type pip install "magjax[scale]"') from None
+        self.library, self.where = distributed, where
+
+    def run(self, name, work, inputs, tasks):
+        """See the module."""
+        own = isinstance(self.where, str)
+        client = self._connect() if own else self.where
+        blob = pack(inputs)
+        key = hashlib.sha256(blob).hexdigest()
+        label = f"magjax-{key[:8]}-{uuid.uuid4().hex[:8]}"
+        futures = {}
+        try:
+            shared = client.submit(bytes, blob, key=f"{label}-inputs")
+            for number, (chunk, item, entropy) in enumerate(tasks):
+                future = client.submit(perform_packed, work, key, shared, item, entropy, key=f"{label}-{number}", retries=0)
+                futures[future.key] = (chunk, future)
+            for future in self.library.as_completed([f for _, f in futures.values()]):
+                chunk = futures[future.key][0]
+                try:
+                    result = future.result()
+                except self.library.scheduler.KilledWorker:
+                    raise _given_up(name, chunk, "ended every dask worker that it was given to") from None
+                yield chunk, result
+                future.release()
+        finally:
+            client.cancel([f for _, f in futures.values()], reason="the job has ended")
+            if own:
+                client.close()
+
+    def _connect(self):
+        try:
+            return self.library.Client(self.where, timeout="10s", set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise ConfigurationError(f"no dask scheduler answers at {self.where} ({error}); start one (dask scheduler) and give its address") from None

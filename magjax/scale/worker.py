@@ -1,0 +1,85 @@
+"""What runs inside a worker: JAX set up as in the process that asked, inputs unpickled once, a chunk at a time.
+
+JAX must be in double precision before the inputs are unpickled: arrays would lose half their digits on the way in.
+"""
+
+import os
+import pickle
+import signal
+import sys
+import threading
+
+SETTINGS = ("jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_default_matmul_precision")
+
+_opened: dict[str, object] = {}  # digest -> inputs of the job at hand; one at a time
+_guard = threading.Lock()
+
+
+def settings() -> dict:
+    """JAX settings of this process that a worker takes over; {} where JAX is not in use."""
+    if "jax" not in sys.modules:
+        return {}
+    import jax
+
+    return {name: getattr(jax.config, name) for name in SETTINGS}
+
+
+def take_over(found: dict) -> None:
+    """Apply another process's settings."""
+    if not found:
+        return
+    import jax
+
+    for name, value in found.items():
+        if getattr(jax.config, name) != value:
+            jax.config.update(name, value)
+
+
+def pack(inputs) -> bytes:
+    """Inputs with the settings that they need."""
+    return pickle.dumps((settings(), pickle.dumps(inputs)))
+
+
+def open_inputs(name: str, blob: bytes):
+    """The inputs of a job, unpickled when first asked for; `name`: digest of the blob."""
+    with _guard:
+        if name not in _opened:
+            found, content = pickle.loads(blob)
+            take_over(found)
+            _opened.clear()
+            _opened[name] = pickle.loads(content)
+        return _opened[name]
+
+
+def perform_packed(work, name: str, blob: bytes, item, entropy):
+    """One chunk with packed inputs: for engines whose workers serve many jobs."""
+    from .job import perform
+
+    return perform(work, open_inputs(name, blob), item, entropy)
+
+
+def begin(name: str, blob: bytes) -> int:
+    """First call in a process of our own pool; returns its process id.
+
+    Ctrl-C is the parent's to handle. A parent that was killed cannot tell its workers: they watch it and leave.
+    """
+    import multiprocessing
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    open_inputs(name, blob)
+    return os.getpid()
+
+
+def _leave_with(parent):
+    parent.join()
+    os._exit(1)
+
+
+def perform_opened(work, name: str, item, entropy):
+    """One chunk in a process of our own pool, whose inputs are there already."""
+    from .job import perform
+
+    return perform(work, _opened[name], item, entropy)

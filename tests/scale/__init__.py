@@ -1,0 +1,1 @@
+"""Tests of jobs in chunks, and of what is built on them."""
