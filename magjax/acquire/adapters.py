@@ -41,10 +41,13 @@ class BinaryAdapter:
         messages = []
         for payload in self.splitter.feed(chunk):
             kind = payload[0]
+            if not p.whole(payload):
+                self.misfits += 1
+                continue
             if kind != p.DATA:
                 messages.append((kind, payload))
                 continue
-            frame = p.read_data(payload, self.channels) if self.channels and len(payload) >= p.DATA_HEAD.size else None
+            frame = p.read_data(payload, self.channels) if self.channels else None
             if frame is None:
                 self.misfits += 1
             else:

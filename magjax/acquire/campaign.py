@@ -166,7 +166,8 @@ def _table_entry(kind, drive, settings):
 
 @dataclasses.dataclass
 class Campaign:
-    """Where and how a list of entries is recorded. `say(text)`: progress; `live(dict)`: the recorder's reports; `header`: provenance."""
+    """Where and how a list of entries is recorded. `say(text)`: progress; `live(dict)`: the recorder's reports; `header`: provenance;
+    `amplifier`: port of a SCPI amplifier."""
 
     port: str
     bench: object
@@ -179,6 +180,7 @@ class Campaign:
     give_up_s: float = 15.0
     say: object = print
     live: object = None
+    amplifier: str | None = None
 
     def rate_max(self) -> float:
         """What the device samples at most, Hz."""
@@ -221,7 +223,7 @@ class Campaign:
                 path.rename(self.folder / f"{entry.name}.bad{bad}.mjlog")
             order = Order(
                 self.port, str(path), entry.rate, entry.samples, settle, entry.drive, self.baud, self.limit, durable=self.durable,
-                give_up_s=self.give_up_s, demagnetize=bool(self.settings["demagnetize"]), header=self.header,
+                give_up_s=self.give_up_s, amplifier=self.amplifier, demagnetize=bool(self.settings["demagnetize"]), header=self.header,
                 about={"settle_samples": settle, "drive": entry.text} | ({"frequency_Hz": entry.frequency} if entry.frequency else {}),
                 loop_samples=min(entry.samples, 4000),
             )  # fmt: skip

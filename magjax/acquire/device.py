@@ -45,7 +45,7 @@ class Device:
         last = (
             None
             if self.last is None
-            else dict(zip(("reason", "run", "last_seq", "frames", "samples", "dropped"), self._last_row(), strict=True))
+            else dict(zip(p.LAST, self._last_row(), strict=True))
         )
         return p.hello_packet({
             "protocol": p.VERSION, "device": self.name, "firmware": "magjax emulator 1", "boot_id": self.boot_id, "rate_max_Hz": self.rate_max,

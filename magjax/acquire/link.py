@@ -8,12 +8,13 @@ from pathlib import Path
 
 import serial
 
-from ..errors import DeviceError
+from ..errors import ConfigurationError, DeviceError
 from . import protocol as p
 from .framing import Splitter, encode
 
 READ = 4096  # bytes a read: large reads with a short timeout, never byte by byte
 TIMEOUT = 0.03  # s
+LINK_ERRORS = (serial.SerialException, OSError)
 
 
 def open_port(name: str, baud: int = 2_000_000):
@@ -86,13 +87,17 @@ def ask_hello(port, wait: float, splitter=None) -> p.Hello:
     splitter = splitter or Splitter()
     end, ask = time.monotonic() + wait, 0.0
     while time.monotonic() < end:
-        if time.monotonic() > ask:
-            port.write(encode(p.bare_packet(p.QUERY)))
-            ask = time.monotonic() + 0.4
-        for payload in splitter.feed(quick_read(port)):
+        try:
+            if time.monotonic() > ask:
+                port.write(encode(p.bare_packet(p.QUERY)))
+                ask = time.monotonic() + 0.4
+            chunk = quick_read(port)
+        except LINK_ERRORS as error:
+            raise DeviceError(f"{port.name}: the link broke before the device said HELLO ({error}); check plug and power") from None
+        for payload in splitter.feed(chunk):
             if payload[0] == p.HELLO:
                 return p.read_hello(payload)
-            if payload[0] == p.ACK and payload[2] == p.QUERY:
+            if p.whole(payload) and payload[0] == p.ACK and payload[2] == p.QUERY:
                 raise DeviceError(f"the device refuses the handshake: {p.read_ack(payload).text}; load the matching firmware")
     heard = f"{splitter.received} bytes came, none of them a frame of the protocol" if splitter.received else "nothing came"
     raise DeviceError(
@@ -102,10 +107,36 @@ def ask_hello(port, wait: float, splitter=None) -> p.Hello:
 
 def writable(path) -> None:
     """Refuse a target before the device is touched."""
-    from ..errors import ConfigurationError
-
     folder = Path(path).parent
+    if Path(path).is_dir():
+        raise ConfigurationError(f"{path}: is a folder; give the name of a file in it")
     if not folder.is_dir():
         raise ConfigurationError(f"{path}: the folder {folder} does not exist; make it first")
     if not os.access(folder, os.W_OK):
         raise ConfigurationError(f"{path}: the folder {folder} cannot be written; choose another place")
+
+
+def shut(port) -> None:
+    """Close a port that may be broken."""
+    try:
+        port.close()
+    except LINK_ERRORS:
+        return
+
+
+def try_device(name, baud, wanted, wait: float = 1.0):
+    """(port, hello) where the device with the HELLO `wanted` answers at this name, else None; `wanted` None: any, hello None."""
+    try:
+        port = open_port(name, baud)
+    except DeviceError:
+        return None
+    if wanted is None:
+        return port, None
+    try:
+        hello = ask_hello(port, wait)
+        if hello.device == wanted.device:
+            return port, hello
+    except DeviceError:
+        pass  # not this one; the next name is tried
+    shut(port)
+    return None

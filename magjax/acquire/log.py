@@ -9,6 +9,7 @@ a thread of its own, for power cuts. A write that falls short (full disk) is cut
 
 import json
 import os
+import shutil
 import struct
 import threading
 import time
@@ -122,6 +123,14 @@ class LogWriter:
         except OSError:
             pass  # a pipe or a full disk: nothing more can be done for it
         os.close(self._descriptor)
+
+
+def free_room(path) -> int:
+    """Bytes free where a file lies; 0 where that cannot be told (its folder is gone)."""
+    try:
+        return shutil.disk_usage(os.path.dirname(os.path.abspath(path))).free
+    except OSError:
+        return 0
 
 
 def chunks(content: bytes):

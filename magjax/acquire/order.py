@@ -20,7 +20,7 @@ class Order:
     "values", "repeats"} (A, uploaded); `rate`: Hz; `samples`: to keep (0: until stopped), after `settle_samples`; `limit_A`: of drive and
     measured current; `about`: what the log's start event states (frequency_Hz, drive); `header`: provenance; `demagnetize`: a decaying sine from the
     limit (or the drive's peak) runs before each start, and is not kept; `text`: columns of a
-    text-line device, "" to wait for its header line; `amplifier`: port of a SCPI amplifier. `run`: numbers the run, new for each, so
+    text-line device, "" to wait for its header line; `amplifier`: port of a SCPI amplifier; `resume_header`: that of the log to append to. `run`: numbers the run, new for each, so
     that a START sent twice is one run.
     """
 
@@ -36,7 +36,7 @@ class Order:
     durable: bool = False
     resume: bool = False
     resume_from: int = -1
-    resume_device: str = ""
+    resume_header: dict = dataclasses.field(default_factory=dict)
     demagnetize: bool = False
     text: str | None = None
     amplifier: str | None = None
@@ -75,8 +75,22 @@ class Order:
             return abs(self.drive["amplitude"]) + abs(self.drive["offset"])
         return float(np.max(np.abs(self.drive["values"])))
 
+    def check_numbers(self) -> None:
+        """Refuse what is no number, or one that makes no sense, before any port is opened."""
+        positive = {"baud": self.baud, "limit": self.limit_A, "seconds": self.max_s, "give-up": self.give_up_s}
+        if self.text is None:
+            positive["rate"] = self.rate
+        for name, value in positive.items():
+            if value is not None and not 0 < value < np.inf:
+                raise ConfigurationError(f"--{name} = {value:g}; give a number above zero")
+        if not np.isfinite(self.peak()):
+            raise ConfigurationError("the drive holds values that are no numbers; give amplitude and offset in A")
+        if self.samples < 0 or self.settle_samples < 0:
+            raise ConfigurationError(f"{self.samples} samples after {self.settle_samples} to settle; give zero or more")
+
     def check_limit(self) -> None:
         """Refuse a drive beyond the limit before any port is opened."""
+        self.check_numbers()
         if self.limit_A and self.peak() > self.limit_A * (1 + 1e-9):
             raise ConfigurationError(
                 f"the drive reaches {self.peak():.4g} A where the limit is {self.limit_A:g} A; lower amplitude or offset, or raise limits.current_A"

@@ -24,8 +24,11 @@ START_BODY = struct.Struct("<BBIIQ")  # run, rate in mHz, samples (0: until STOP
 ACK_BODY = struct.Struct("<BBBBI")  # command, status, value; then text
 DATA_HEAD = struct.Struct("<BBHIQ")  # samples, sequence number, device time of the first sample in us; then i16 counts
 FINAL_BODY = struct.Struct("<BBBIIQQI")  # reason, run, last sequence number, frames, samples, frames the device dropped
+SHORTEST = {ACK: ACK_BODY.size, DATA: DATA_HEAD.size, FINAL: FINAL_BODY.size}  # bytes of a payload
 DRIVE_CHUNK = 100  # counts a DRIVE packet: fits a small microcontroller's buffer
 REASONS = {0: "stopped by the host", 1: "all samples sent", 2: "watchdog: the host was silent", 3: "device limit"}
+
+LAST = ("reason", "run", "last_seq", "frames", "samples", "dropped")  # of HELLO, as in FINAL
 
 SI = {
     "current": {"A": 1.0, "mA": 1e-3},
@@ -79,6 +82,11 @@ class Hello:
     content: dict = dataclasses.field(default_factory=dict)
 
 
+def whole(payload: bytes) -> bool:
+    """Is a payload from a device at least as long as its kind? (Its CRC fits: a shorter one is an error of the firmware.)"""
+    return len(payload) >= SHORTEST.get(payload[0], 2)
+
+
 def hello_packet(content: dict) -> bytes:
     """HELLO with its JSON."""
     return bytes((HELLO, VERSION)) + json.dumps(content, separators=(",", ":")).encode()
@@ -100,6 +108,10 @@ def read_hello(payload: bytes) -> Hello:
             int(content["frame_samples"]), channels, content.get("drive"), int(content.get("clock_bits", 64)),
             float(content.get("watchdog_s", 0.0)), bool(content.get("running", False)), content.get("last"), content,
         )  # fmt: skip
+        if hello.drive is not None:
+            hello = dataclasses.replace(hello, drive={**hello.drive, **{k: float(hello.drive[k]) for k in ("scale", "limit", "table")}})
+        if hello.last is not None:
+            hello = dataclasses.replace(hello, last={k: int(hello.last[k]) for k in LAST})
     except (ValueError, TypeError) as error:
         raise DeviceError(
             f"the device's HELLO cannot be read ({error}); it is not a magjax device, or its firmware is damaged"
@@ -108,6 +120,17 @@ def read_hello(payload: bytes) -> Hello:
         raise DeviceError(f"the device's HELLO lacks {error}; see docs/protocol.md") from None
     if not channels or hello.frame_samples < 1:
         raise DeviceError("the device's HELLO names no channel or no samples a frame; see docs/protocol.md")
+    numbers = {"rate_max_Hz": hello.rate_max, "clock_bits": hello.clock_bits if hello.clock_bits <= 64 else -1}
+    numbers |= {f"scale of {c.name}": abs(c.scale) for c in channels}
+    numbers |= {f"drive {k}": hello.drive[k] for k in ("scale", "limit", "table")} if hello.drive else {}
+    for name, value in numbers.items():
+        if not 0 < value < np.inf:
+            raise DeviceError(f"the device's HELLO gives {name} = {value:g}; mend the firmware (docs/protocol.md)")
+    if not all(np.isfinite(c.offset) for c in channels) or not 0 <= hello.watchdog_s < np.inf:
+        raise DeviceError("the device's HELLO gives an offset or watchdog_s that is no number; mend the firmware (docs/protocol.md)")
+    names = [c.name for c in channels]
+    if len(set(names)) < len(names):
+        raise DeviceError(f"the device names two channels alike ({', '.join(names)}); mend the firmware (docs/protocol.md)")
     return hello
 
 

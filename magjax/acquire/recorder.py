@@ -4,26 +4,23 @@ Whatever ends it (the count, Ctrl-C, a limit, a full disk, a silent device), the
 last word; after kill -9 the device's watchdog does the first.
 """
 
+import contextlib
 import json
-import os
-import secrets
-import shutil
 import time
 
 import numpy as np
-import serial
 
 from ..errors import ConfigurationError, DeviceError
 from . import protocol as p
 from .adapters import BinaryAdapter, ScpiAmplifier, TextAdapter
+from .dialogue import command, demagnetize, end_foreign_run
 from .framing import encode
-from .link import READ, ask_hello, candidates, open_port, quick_read
-from .log import DiskFull, LogWriter
+from .link import LINK_ERRORS, READ, ask_hello, candidates, open_port, quick_read, shut, try_device
+from .log import DiskFull, LogWriter, free_room
 from .order import Order
 from .tracker import Tracker
 
 FLUSH, TELL = 0.05, 0.2  # s
-LINK_ERRORS = (serial.SerialException, OSError)
 
 
 class Ended(Exception):
@@ -46,7 +43,7 @@ class Recorder:
         self.pending, self.pending_at = [], None
         self.totals = {"received": 0, "lost": 0, "repeats": 0, "sent": 0, "dropped_by_device": 0, "tail_known": True}
         self.acknowledged, self.waiting = 0, []
-        self.loop = None
+        self.loop, self.patience, self.saved = None, 0.0, 0  # `saved`: samples of this segment in the log
 
     # the course of a recording
 
@@ -54,14 +51,13 @@ class Recorder:
         """Record; returns the summary, which is also the log's last chunk. Raises `MagjaxError` before anything was recorded."""
         order = self.order
         self._connect()
+        self.check_stop()
         order.check(self.hello)
         if order.amplifier:
             self.amplifier = ScpiAmplifier(order.amplifier, order.limit_A)
         header = None if order.resume else order.header | self._device_header()
-        if order.resume and order.resume_device != self.hello.device:
-            raise ConfigurationError(
-                f"{order.path}: recorded from {order.resume_device}, but {self.hello.device} answers; give a new --out"
-            )
+        if order.resume:
+            self._check_resume()
         self.log = LogWriter(order.path, header, order.durable)
         ended = Ended("the recorder failed", 6)
         try:
@@ -80,10 +76,22 @@ class Recorder:
         except DeviceError as error:
             ended = Ended(str(error), 5 if self.totals["received"] == 0 and not self.pending else 6)
         except LINK_ERRORS as error:
-            ended = Ended(f"{order.port}: the link broke ({error})", 6)
+            ended = Ended(f"{order.port}: the link broke ({error})", 6 if self.totals["received"] or self.pending else 5)
         finally:
             summary = self._close(ended)
         return summary
+
+    def _check_resume(self):
+        """Refuse another device, or another calibration: a log has one for all its samples."""
+        order, now = self.order, self._device_header()
+        if order.resume_header.get("device") != now["device"]:
+            raise ConfigurationError(
+                f"{order.path}: recorded from {order.resume_header.get('device')}, but {now['device']} answers; give a new --out"
+            )
+        if order.resume_header.get("channels") != now["channels"]:
+            raise ConfigurationError(
+                f"{order.path}: the device's channels or calibration are no longer those of this log; give a new --out"
+            )
 
     def _connect(self):
         self.port = open_port(self.order.port, self.order.baud)
@@ -93,7 +101,10 @@ class Recorder:
             end = time.monotonic() + self.order.boot_wait_s
             held = []
             while self.adapter.hello is None and time.monotonic() < end:
-                held += self.adapter.feed(quick_read(self.port))
+                try:
+                    held += self.adapter.feed(quick_read(self.port))
+                except LINK_ERRORS as error:
+                    raise DeviceError(f"{self.order.port}: the link broke before the first line ({error})") from None
             if self.adapter.hello is None:
                 raise DeviceError(
                     f"{self.order.port}: no line # seq,t_us,... within {self.order.boot_wait_s:g} s; name the columns with --text COLUMNS"
@@ -113,22 +124,23 @@ class Recorder:
             raise Ended(f"given up after {self.order.attempts} starts; see the events in the log", 6)
         order = self.order
         self.segment += 1
-        self.final, self.quiet_since, self.asked = None, time.monotonic(), 0.0
+        self.final, self.quiet_since, self.asked, self.saved = None, time.monotonic(), 0.0, 0
         if order.text is not None:
             self.tracker = None
             self.log.event("start", segment=self.segment, **order.about)
             return
         if self.hello.running:
-            self._end_foreign_run()
+            end_foreign_run(self, order.stop_wait_s)
         if order.demagnetize and order.drive:
-            self._demagnetize()
+            demagnetize(self, order, self.hello)
+            self.log.event("demagnetized", segment=self.segment)
         for packet in order.drive_packets():
-            self._command(packet, p.DRIVE if packet[0] == p.DRIVE else p.GENERATE, 5.0)
+            command(self, packet, packet[0], order.stop_wait_s + 2.0)
         run = (order.run + self.segment) & 0xFFFFFFFF
-        backlog = []
-        answer = self._command(p.start_packet(run, order.rate, order.total_samples), p.START, order.start_wait_s, backlog)
+        answer, backlog = command(self, p.start_packet(run, order.rate, order.total_samples), p.START, order.start_wait_s)
         rate = float(json.loads(answer.text or "{}").get("rate_Hz", order.rate))
         self.tracker = Tracker(rate, answer.value, self.hello.frame_samples, self.hello.clock_bits)
+        self.patience = 2 * self.hello.frame_samples / rate  # a slow device sends a frame now and then
         self.run_number = run
         self.log.event(
             "start", segment=self.segment, rate_Hz=rate, run=run, boot_id=self.hello.boot_id, **order.about, **order.command()
@@ -137,51 +149,10 @@ class Recorder:
         for kind, value in backlog:
             self._take(kind, value)
 
-    def _demagnetize(self):
-        """A decaying sine; its samples are not kept."""
-        packet, rate, samples = self.order.demagnetizing()
-        self._command(packet, p.GENERATE, 5.0)
-        self._command(p.start_packet(secrets.randbits(31), rate, samples), p.START, self.order.start_wait_s)
-        end, alive = time.monotonic() + samples / rate + 5.0, 0.0
-        while time.monotonic() < end:
-            if self.stop:
-                raise Ended(*self.stop)
-            if time.monotonic() > alive:
-                self.port.write(encode(p.bare_packet(p.QUERY)))  # keeps the watchdog quiet, and tells when the run is over
-                alive = time.monotonic() + 0.25 * (self.hello.watchdog_s or 2.0)
-            for kind, value in self.adapter.feed(self.port.read(READ)):
-                if kind == p.FINAL or (kind == p.HELLO and not p.read_hello(value).running):
-                    self.log.event("demagnetized", segment=self.segment)
-                    return
-        raise DeviceError(f"{self.order.port}: the demagnetizing drive did not end; check the link")
-
-    def _end_foreign_run(self):
-        """A run that a killed recorder left behind."""
-        end, over = time.monotonic() + self.order.stop_wait_s, False
-        self.port.write(encode(p.bare_packet(p.STOP)))
-        while not over and time.monotonic() < end:
-            over = any(kind == p.FINAL for kind, _ in self.adapter.feed(self.port.read(READ)))
-
-    def _command(self, packet, kind, wait, backlog=None):
-        """Send a command until it is acknowledged; what else comes is kept in `backlog`."""
-        end, again = time.monotonic() + wait, 0.0
-        while time.monotonic() < end:
-            if self.stop:
-                raise Ended(*self.stop)
-            if time.monotonic() > again:
-                self.port.write(encode(packet))
-                again = time.monotonic() + 0.5
-            answer = None
-            for found, value in self.adapter.feed(quick_read(self.port)):
-                if found == p.ACK and value[2] == kind:
-                    answer = answer or p.read_ack(value)
-                elif backlog is not None:
-                    backlog.append((found, value))
-            if answer is not None:
-                if answer.status:
-                    raise DeviceError(f"the device refuses {p.NAMES[kind]}: {answer.text}")
-                return answer
-        raise DeviceError(f"{self.order.port}: the device does not acknowledge {p.NAMES[kind]} within {wait:g} s; check the link")
+    def check_stop(self):
+        """Raise `Ended` where a signal asked for the end."""
+        if self.stop:
+            raise Ended(*self.stop)
 
     def _record(self):
         begin = time.monotonic()
@@ -200,8 +171,7 @@ class Recorder:
 
     def _timers(self, begin):
         now, order = time.monotonic(), self.order
-        if self.stop:
-            raise Ended(*self.stop)
+        self.check_stop()
         if order.max_s and now - begin > order.max_s:
             raise Ended(f"the duration limit of {order.max_s:g} s is reached", 0 if not order.total_samples else 6)
         if self.hello.watchdog_s and now - self.alive > 0.25 * self.hello.watchdog_s:
@@ -214,13 +184,13 @@ class Recorder:
             self._progress()
             self.told = now
         silent = now - self.quiet_since
-        if silent > order.stall_s and now - self.asked > 1.0:
+        if silent > order.stall_s + self.patience and now - self.asked > 1.0:
             if self.asked < self.quiet_since:
                 self.log.event("stall", segment=self.segment, silent_s=silent)
             self.asked = now
             if order.text is None:
                 self.port.write(encode(p.bare_packet(p.QUERY)))
-        if silent > order.give_up_s:
+        if silent > order.give_up_s + self.patience:
             raise Ended(f"{order.port}: the device has been silent for {silent:.1f} s", 6)
 
     def _run_over(self) -> bool:
@@ -273,8 +243,13 @@ class Recorder:
     def _take_hello(self, hello):
         if hello.device != self.hello.device:
             raise Ended(f"another device answers: {hello.device} where {self.hello.device} was recorded", 6)
-        if hello.boot_id != self.hello.boot_id:
-            self.hello = hello
+        known, self.hello = self.hello, hello
+        if self.order.text is not None:
+            return
+        if self.tracker is None:
+            self._lost_device("its answer to START was lost")
+            return
+        if hello.boot_id != known.boot_id:
             self._lost_device(f"the device was reset (boot_id {hello.boot_id})")
             return
         last = hello.last or {}
@@ -296,6 +271,7 @@ class Recorder:
             counts = np.concatenate(self.pending)
             self.pending = []
             self.log.data(self.segment, self.pending_at[0], (self.pending_at[1], self.pending_last), counts)
+            self.saved += len(counts)
             self.totals["received"] += len(counts)
             self.waiting.append((self.log.written, self.totals["received"]))
             self._guard(counts)
@@ -319,39 +295,40 @@ class Recorder:
         """The port broke: look for the same device, under other names too."""
         self._flush()
         self.log.event("disconnect", segment=self.segment, why=str(error))
-        _shut(self.port)
+        shut(self.port)
         end = time.monotonic() + self.order.give_up_s
         while time.monotonic() < end:
             for name in candidates(self.order.port):
-                port = _try_device(name, self.order, self.hello)
+                port = try_device(name, self.order.baud, None if self.order.text is not None else self.hello, self.order.boot_wait_s / 5)
                 if port is None:
                     continue
-                self.port, hello = port
+                self.port, hello = port[0], port[1] or self.hello
                 self.adapter.forget()
                 self.quiet_since = time.monotonic()
                 self.log.event("reconnect", segment=self.segment, port=name, boot_id=hello.boot_id)
                 self._take_hello(hello)
                 return
-            if self.stop:
-                raise Ended(*self.stop)
+            self.check_stop()
             time.sleep(0.1)
         raise Ended(f"{self.order.port}: unplugged ({error}) and not back within {self.order.give_up_s:g} s", 6)
 
     def _settle_accounts(self):
-        """Book a segment: received + lost = sent, by the device's own count where it gave one."""
+        """Book a segment: received + lost = sent, by the device's own count where it gave one; received is what is in the log."""
         t, tracker = self.totals, self.tracker
         if tracker is None:
             return
+        self._flush()
+        received, sent = self.saved, tracker.received + tracker.known_lost
         if self.final is not None:
-            lost, sent = self.final.samples - tracker.received, self.final.samples
+            sent = self.final.samples
             t["dropped_by_device"] += self.final.dropped
         else:
-            lost, sent = tracker.known_lost, tracker.received + tracker.known_lost
             t["tail_known"] = False
+        lost = sent - received
         t["lost"] += lost
         t["sent"] += sent
         t["repeats"] += tracker.repeats
-        row = {"segment": self.segment, "received": tracker.received, "lost": lost, "sent": sent, "gaps": len(tracker.gaps)}
+        row = {"segment": self.segment, "received": received, "lost": lost, "sent": sent, "gaps": len(tracker.gaps)}
         self.tracker = None
         self.log.event("counts", **row, tail_known=self.final is not None)
 
@@ -367,7 +344,8 @@ class Recorder:
                     again = time.monotonic() + 0.4
                 for kind, value in self.adapter.feed(self.port.read(READ)):
                     if kind == p.DATA and self.tracker:
-                        self._take_data(value)
+                        with contextlib.suppress(DiskFull, Ended):  # the drive first: what found no room is booked as lost
+                            self._take_data(value)
                     elif kind == p.FINAL:
                         final = p.read_final(value)
                         if self.tracker is None or final.run == self.run_number:
@@ -383,12 +361,11 @@ class Recorder:
                 self.amplifier.off()
             except LINK_ERRORS:
                 reason += "; the amplifier could not be told to switch off"
-        try:
-            self._stop_device()
-            self._flush()
-            self._settle_accounts()
-        except (DiskFull, Ended) as error:
-            status, reason = max(status, 6), reason if status else str(error)
+        for step in (self._stop_device, self._flush, self._settle_accounts):
+            try:
+                step()
+            except (DiskFull, Ended) as error:
+                status, reason = max(status, 6), reason if status else str(error)
         zero = self.final is not None or bool(self.order.text is not None)
         summary = {
             "reason": reason, "status": status, "segments": self.segment + 1, **self.totals, "damaged_frames": self.adapter.damaged,
@@ -401,7 +378,7 @@ class Recorder:
         except DiskFull:
             summary["reason"] = f"{reason} (no room for the log's last chunk)" if "disk" not in reason else reason
         self.log.close()
-        _shut(self.port)
+        shut(self.port)
         self.acknowledged = self.totals["received"]
         return {**summary, "acknowledged": self.acknowledged, "bytes": self.log.written}
 
@@ -413,30 +390,6 @@ class Recorder:
         self.tell({
             "state": "recording", "acknowledged": self.acknowledged, "received": self.totals["received"], "lost": self.totals["lost"] + known,
             "damaged_frames": self.adapter.damaged, "bytes": self.log.written, "link_bytes": self.adapter.received, "segment": self.segment,
-            "disk_free": shutil.disk_usage(os.path.dirname(os.path.abspath(self.order.path))).free, "loop": loop, "host_time": time.time(),
+            "disk_free": free_room(self.order.path), "loop": loop, "host_time": time.time(),
         })  # fmt: skip
 
-
-def _shut(port):
-    try:
-        port.close()
-    except LINK_ERRORS:
-        return
-
-
-def _try_device(name, order, wanted):
-    """(port, hello) where the wanted device answers at this name."""
-    try:
-        port = open_port(name, order.baud)
-    except DeviceError:
-        return None
-    if order.text is not None:
-        return port, wanted
-    try:
-        hello = ask_hello(port, 1.0)
-        if hello.device == wanted.device:
-            return port, hello
-    except (DeviceError, *LINK_ERRORS):
-        pass  # not this one; the next name is tried
-    _shut(port)
-    return None

@@ -146,6 +146,7 @@ def _record_options(p):
     p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name: its limits hold")
     p.add_argument("--out", required=True, help="log to write (.mjlog), or the folder of a plan's recordings")
     p.add_argument("--baud", type=int, default=2_000_000, help="baud rate (default 2000000)")
+    p.add_argument("--amplifier", metavar="PORT", help="set up a SCPI amplifier there, and switch it off at the end")
     p.add_argument("--limit", type=float, help="current limit, A (default: the bench's)")
     p.add_argument("--durable", action="store_true", help="acknowledge samples only after they are on the disk (fsync)")
     p.add_argument("--give-up", type=float, default=15.0, help="s of silence after which the recording ends (default 15)")
@@ -174,7 +175,6 @@ def run_record(arguments) -> int:
         metavar="COLUMNS",
         help="text-line device; COLUMNS such as seq,t_us,current_mA,displacement_um",
     )
-    p.add_argument("--amplifier", metavar="PORT", help="set up a SCPI amplifier there, and switch it off at the end")
     p.add_argument("--resume", action="store_true", help="append to a log that exists")
     p.add_argument("--export", help="write the recording to this file, too (.nc, .csv, .mat, .parquet)")
     options = p.parse_args(arguments)
@@ -194,15 +194,20 @@ def _run_single(options, arguments) -> int:
     bench = load_bench(options.bench)
     path = Path(options.out)
     writable(path)
+    if path.suffix.lower() != ".mjlog":
+        raise ConfigurationError(f"{path}: a log is read by its ending; write {path.with_suffix('.mjlog').name} (and --export for others)")
+    if path.exists() and not options.resume:
+        raise ConfigurationError(f"{path}: exists already; choose another name or add --resume")
     if options.export:
         known_ending(Path(options.export))
-    limit = options.limit or bench.limits.get("current_A")
+        writable(options.export)
+    limit = bench.limits.get("current_A") if options.limit is None else options.limit
     order = Order(options.port, os.fspath(path), baud=options.baud, limit_A=limit, max_s=options.seconds, durable=options.durable, text=options.text,
                   amplifier=options.amplifier, give_up_s=options.give_up, header=provenance("record", arguments, bench.name))  # fmt: skip
     if options.text is not None:
         order.rate = options.rate or 0.0
     elif options.no_drive:
-        order.rate, order.samples = options.rate or 1e4, 0
+        order.rate, order.samples = 1e4 if options.rate is None else options.rate, 0
     else:
         _sine(order, options)
     if options.resume:
@@ -223,15 +228,16 @@ def campaign(options, arguments, command, live, say):
     from .runtime import output_folder
 
     bench = load_bench(options.bench)
-    limit = options.limit or bench.limits.get("current_A")
+    limit = bench.limits.get("current_A") if options.limit is None else options.limit
     return Campaign(options.port, bench, output_folder(options.out), limit, dict(SETTINGS), provenance(command, arguments, bench.name),
-                    options.baud, options.durable, options.give_up, say, live)  # fmt: skip
+                    options.baud, options.durable, options.give_up, say, live, options.amplifier)  # fmt: skip
 
 
 def _run_plan(options, arguments) -> int:
     from magjax.acquire.campaign import entries, read_plan
     from magjax.acquire.display import Live
 
+    _refuse_beside_plan(options)
     plan = read_plan(options.plan)
     quiet = options.quiet or options.json
     with Live(quiet) as live:
@@ -248,6 +254,15 @@ def _run_plan(options, arguments) -> int:
             print(f"  {row['name']:32s} {'good' if not row['problems'] else row['problems'][0]}")
         print(f"{good} of {len(rows)} recordings are fit to use, in {options.out}")
     return status
+
+
+def _refuse_beside_plan(options):
+    """A plan has its own drives and exports: what it does not heed is no silent option."""
+    given = {"--no-drive": options.no_drive, "--text": options.text is not None, "--export": options.export, "--seconds": options.seconds,
+             "--rate": options.rate}  # fmt: skip
+    for name, value in given.items():
+        if value:
+            raise ConfigurationError(f"{name} does nothing beside --plan, which says what is recorded; leave one of the two out")
 
 
 def _sine(order, options):
@@ -273,8 +288,11 @@ def _resume(order):
 
     if not Path(order.path).exists():
         raise ConfigurationError(f"{order.path}: no such log to resume; leave --resume out")
-    log = Log(order.path)
-    order.resume, order.resume_device = True, log.header["device"]
+    try:
+        log = Log(order.path)
+    except OSError as error:
+        raise ConfigurationError(f"{order.path}: cannot be read ({error.strerror}); choose another --out") from None
+    order.resume, order.resume_header = True, log.header
     order.resume_from = max([s[0] for s in log.pieces] + [e["segment"] for e in log.events if "segment" in e], default=-1)
 
 

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ def emulate():
             "--bench",
             bench,
             *(["--exact"] if bench == "plain" else []),
+            *([] if "--watchdog" in options else ["--watchdog", "20"]),  # a loaded machine may hold the recorder up
             *options,
         ]
         process = subprocess.Popen(
@@ -58,13 +60,24 @@ def order(tmp_path):
             "rate": 50e3,
             "samples": 100_000,
             "drive": drive,
-            "start_wait_s": 5.0,
-            "give_up_s": 5.0,
+            "boot_wait_s": 30.0,
+            "start_wait_s": 30.0,
+            "stop_wait_s": 30.0,
+            "give_up_s": 30.0,
             "header": {"bench": "plain"},
         }
         return Order(port, str(tmp_path / "run.mjlog"), **{**given, **changes})
 
     return make
+
+
+def until(what, seconds: float = 30.0):
+    """Ask again until `what()` is true; its value. Fails after so many seconds: a loaded machine is slow, not wrong."""
+    end = time.monotonic() + seconds
+    while not (found := what()):
+        assert time.monotonic() < end, f"not within {seconds} s"
+        time.sleep(0.02)
+    return found
 
 
 def verify(path) -> Log:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import verify
+from conftest import until, verify
 
 from magjax.acquire.framing import encode
 from magjax.acquire.link import ask_hello, open_port
@@ -25,11 +25,16 @@ def events(path, kind):
     return [e for e in Log(path).events if e["event"] == kind]
 
 
-def drive_now(port):
-    device = open_port(port)
-    hello = ask_hello(device, 3.0)
-    device.close()
-    return hello.content["drive_now"], hello.running
+def drive_at_zero(port, silence=0.0):
+    """Is the drive at zero and no run on? First `silence` s for the watchdog, longer each time: a question keeps it quiet."""
+    for pause in (silence, 2 * silence, 8 * silence):
+        time.sleep(pause)
+        device = open_port(port)
+        hello = ask_hello(device, 20.0)
+        device.close()
+        if hello.content["drive_now"] == 0 and not hello.running:
+            return True
+    return False
 
 
 def recorder(order, **options):
@@ -66,7 +71,7 @@ def test_clean_run_over_a_pty_and_tcp(emulate, order):
         assert (end["status"], end["reason"], end["received"], end["lost"]) == (0, "done", 100_000, 0)
         log = verify(made.path)
         assert log.samples == 100_000 and log.end["reason"] == "done" and not log.damage
-        assert drive_now(port) == (0, False)
+        assert drive_at_zero(port)
 
 
 @pytest.mark.parametrize(
@@ -123,12 +128,12 @@ def test_a_stall_is_told_and_its_losses_counted(emulate, order):
 
 def test_a_lost_tail_is_counted(emulate, order):
     # the last 60 of 782 frames fall into a silence: no sequence number shows them, only the device's own count
-    port = emulate("--fault", "stall=1.5", "--fault", "at=720")["port"]
+    port = emulate("--fault", "stall=4", "--fault", "at=720")["port"]
     made = order(port, samples=50_000)
     end = record(made)
     assert end["status"] == 0 and end["received"] + end["lost"] == end["sent"] == 50_000
     in_gaps = sum(e["samples"] for e in events(made.path, "gap"))
-    assert end["lost"] - in_gaps > 1000
+    assert end["lost"] - in_gaps > 500
     verify(made.path)
 
 
@@ -177,14 +182,14 @@ def test_ctrl_c_stops_in_order(emulate, order):
     assert child.returncode == 130 and end["reason"] == "interrupted" and end["drive_at_zero"] == "confirmed"
     assert end["received"] + end["lost"] == end["sent"]
     assert verify(made.path).samples == end["acknowledged"] > 0
-    assert drive_now(port) == (0, False)
+    assert drive_at_zero(port)
 
 
 def test_the_duration_limit_ends_it(emulate, order):
     port = emulate()["port"]
     end = record(order(port, samples=0, max_s=0.6))
     assert (end["status"], end["drive_at_zero"]) == (0, "confirmed") and "duration limit" in end["reason"]
-    assert drive_now(port) == (0, False)
+    assert drive_at_zero(port)
 
 
 def test_a_full_disk_ends_the_recording_with_the_drive_at_zero(emulate, order):
@@ -199,8 +204,9 @@ def test_a_full_disk_ends_the_recording_with_the_drive_at_zero(emulate, order):
     end = rest(child)
     assert child.returncode == 6 and "run.mjlog" in end["reason"] and end["drive_at_zero"] == "confirmed"
     log = verify(made.path)
+    assert end["received"] + end["lost"] == end["sent"] > end["received"] == log.samples
     assert log.samples == end["acknowledged"] > 1_000 and not log.damage  # a chunk that no longer fits is lost as a whole
-    assert drive_now(port) == (0, False)
+    assert drive_at_zero(port)
 
 
 def kill_at(order, seconds, recording=True):
@@ -215,7 +221,7 @@ def kill_at(order, seconds, recording=True):
 
 def killed_at_random(emulate, order, count, durable):
     """kill -9 at random moments: all acknowledged samples are in the log, and the device's watchdog ends the run."""
-    port = emulate("--watchdog", "0.4")["port"]
+    port = emulate("--watchdog", "1")["port"]  # the next recorder ends a run that is still on
     random = np.random.default_rng(count)
     kept = 0
     for k in range(count):
@@ -226,9 +232,8 @@ def killed_at_random(emulate, order, count, durable):
             log = verify(made.path)
             assert log.samples >= acknowledged and len(log.damage) <= 1 and log.end is None
             kept += acknowledged > 0
-        time.sleep(0.5)
     assert kept > 0.5 * count
-    assert drive_now(port) == (0, False)
+    assert drive_at_zero(port, 1.2)
 
 
 def test_killed_at_random_moments(emulate, order):
@@ -242,7 +247,7 @@ def test_killed_at_a_hundred_random_moments(emulate, order, durable):
 
 
 def test_a_killed_recording_is_resumed(emulate, order, tmp_path):
-    port = emulate("--watchdog", "0.4")["port"]
+    port = emulate()["port"]
     made = order(port, samples=0)
     assert kill_at(made, 0.3) > 0
     with open(made.path, "ab") as stream:
@@ -272,12 +277,10 @@ def test_a_killed_recording_is_resumed(emulate, order, tmp_path):
 
 def test_stop_is_answered_twice_alike(emulate):
     port = open_port(emulate("--fast")["port"])
-    ask_hello(port, 3.0)
+    ask_hello(port, 20.0)
     port.write(encode(bare_packet(STOP)) * 2)
-    heard, until = b"", time.monotonic() + 20.0
-    while heard.count(b"\0") < 2 and time.monotonic() < until:
-        heard += port.read(200)
-        time.sleep(0.01)
-    first, second, _ = heard.split(b"\0")
+    heard = bytearray()
+    until(lambda: heard.extend(port.read(200)) or heard.count(b"\0") >= 2)
+    first, second, *_ = bytes(heard).split(b"\0")
     assert first == second
     port.close()

@@ -77,6 +77,16 @@ def test_hello_gives_channels_in_si():
         ({"channels": [{"name": "colour", "unit": "A", "scale": 1}]}, "colour"),
         ({"channels": []}, "no channel"),
         ({"rate_max_Hz": None}, "cannot be read"),
+        ({"rate_max_Hz": 0}, "rate_max_Hz = 0"),
+        ({"channels": [{"name": "current", "unit": "A", "scale": float("nan")}]}, "scale of current = nan"),
+        ({"channels": [{"name": "current", "unit": "A", "scale": 0}]}, "scale of current = 0"),
+        ({"channels": [{"name": "current", "unit": "A", "scale": 1}] * 2}, "two channels alike"),
+        ({"channels": 7}, "cannot be read"),
+        ({"clock_bits": 65}, "clock_bits"),
+        ({"drive": {"scale": 1e-4, "limit": 1}}, "lacks 'table'"),
+        ({"drive": {"scale": 0, "limit": 1, "table": 9}}, "drive scale = 0"),
+        ({"last": {"run": 3}}, "lacks 'reason'"),
+        ({"last": "none"}, "cannot be read"),
     ],
 )
 def test_a_wrong_hello_is_one_clear_line(change, words):
