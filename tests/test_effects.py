@@ -26,7 +26,7 @@ def reading(act, current=CURRENT):
 def test_every_effect_is_in_the_catalogue():
     defined = {v for v in vars(effects).values() if isinstance(v, type) and issubclass(v, AbstractEffect) and v is not AbstractEffect}
     assert defined == set(CATALOGUE)
-    assert len({k.name for k in CATALOGUE}) == len(CATALOGUE) == 29
+    assert len({k.name for k in CATALOGUE}) == len(CATALOGUE) >= 29
 
 
 @named
