@@ -7,6 +7,7 @@ from pathlib import Path
 from magjax.errors import ConfigurationError
 
 from .runtime import Progress, output_folder, parser, prepare_jax
+from .scale import add_intervals, check_intervals, intervals, run_fleet
 
 
 def run(command: str, arguments: list[str]) -> int:
@@ -33,9 +34,9 @@ def _bench_and_start(options):
     return load_bench(options.bench), None
 
 
-def _common(command, text, example):
+def _common(command, text, example, recordings="+"):
     p = parser(command, text, example)
-    p.add_argument("recordings", nargs="+", help="recordings (CSV, NetCDF, .mat)")
+    p.add_argument("recordings", nargs=recordings, help="recordings (CSV, NetCDF, .mat)")
     p.add_argument("--bench", help="bench file (TOML) or a built-in name")
     p.add_argument("--model", help="start from a fitted result folder")
     p.add_argument("--check", nargs="+", default=[], help="recordings to predict that take no part in the fit")
@@ -47,16 +48,15 @@ def _common(command, text, example):
 def run_fit(arguments) -> int:
     """magjax fit."""
     p = _common("fit", "Joint fit: all Preisach masses with R_eddy, xi and f0 (or what the bench frees) to all recordings.",
-                "magjax fit rec_*.csv --bench aa-050h --out result")  # fmt: skip
+                "magjax fit rec_*.csv --bench aa-050h --out result", "*")  # fmt: skip
     p.add_argument("--cells", type=int, help="fit one unknown a cell at this level instead of a smooth density")
+    add_intervals(p)
     options = p.parse_args(arguments)
+    check_intervals(options)
     prepare_jax()
     from magjax.recording import load_recordings
 
-    bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
-    recordings = load_recordings(options.recordings, bench)
-    checks = load_recordings(options.check, bench) if options.check else []
     from fitting.check import check_errors
     from fitting.fit import fit
     from fitting.setup import Choices
@@ -64,10 +64,16 @@ def run_fit(arguments) -> int:
     choices = Choices(max_jacobians=options.max_jacobians)
     if options.cells:
         choices = Choices(level=options.cells, knots=None, max_jacobians=options.max_jacobians)
+    if options.fleet:
+        return run_fleet(options, choices, folder, Progress(options.quiet or options.json))
+    bench, actuator = _bench_and_start(options)
+    recordings = load_recordings(options.recordings, bench)
+    checks = load_recordings(options.check, bench) if options.check else []
     held = tuple(f"effects.{e.name}.{q}" for e in (actuator.effects if actuator else ()) for q in e.parameters())
     with Progress(options.quiet or options.json) as progress:
         result = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
-    content = result.as_dict()
+        more, text = intervals(result, options, folder, progress)
+    content = result.as_dict() | more
     content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
     if folder:
         from fitting.report import write_fit
@@ -77,6 +83,8 @@ def run_fit(arguments) -> int:
         print(json.dumps(content))
     else:
         print(result)
+        if text:
+            print(f"\n{text}")
         for row in content["check"]:
             print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g})")
         if folder:

@@ -7,6 +7,7 @@ import numpy as np
 from magjax.errors import ConfigurationError
 
 from .runtime import Progress, output_folder, parser, prepare_jax
+from .scale import add_where, executor_of
 
 
 def run(command: str, arguments: list[str]) -> int:
@@ -94,14 +95,17 @@ def run_sweep(arguments) -> int:
     p.add_argument("--amplitudes", default="0.2,0.5,0.8", help="A")
     p.add_argument("--offsets", default="0", help="A")
     p.add_argument("--out", default="sweep.nc", help="NetCDF file")
+    add_where(p, "finished chunks")
     options = p.parse_args(arguments)
+    executor = executor_of(options)
     prepare_jax()
     actuator, _ = _actuator(options)
     path = _target(options.out)
     from magjax.simulate import sweep
 
-    with Progress(options.quiet or options.json):
-        data = sweep(actuator, _values(options.frequencies), _values(options.amplitudes), _values(options.offsets))
+    grid = [_values(text) for text in (options.frequencies, options.amplitudes, options.offsets)]
+    with Progress(options.quiet or options.json) as progress:
+        data = sweep(actuator, *grid, executor=executor, checkpoint=options.checkpoint, progress=progress)
     data.to_netcdf(path, engine="h5netcdf")
     count = int(np.prod(list(data.sizes.values())))
     print(json.dumps({"file": str(path), "points": count}) if options.json else f"{count} steady states; wrote {path}")

@@ -171,7 +171,7 @@ class Dask:
             for number, (chunk, item, entropy) in enumerate(tasks):
                 future = client.submit(perform_packed, work, key, shared, item, entropy, key=f"{label}-{number}", retries=0)
                 futures[future.key] = (chunk, future)
-            for future in self.library.as_completed([f for _, f in futures.values()]):
+            for future in self.library.as_completed([f for _, f in futures.values()], loop=client.loop):
                 chunk = futures[future.key][0]
                 try:
                     result = future.result()
@@ -180,7 +180,7 @@ class Dask:
                 yield chunk, result
                 future.release()
         finally:
-            client.cancel([f for _, f in futures.values()], reason="the job has ended")
+            client.cancel([f for _, f in futures.values() if not f.done()])
             if own:
                 client.close()
 

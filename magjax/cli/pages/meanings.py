@@ -42,6 +42,8 @@ FIT = {
     "compile_s": "s spent compiling",
     "solve_s": "s spent solving",
     "check": "with --check: one entry a check recording",
+    "bootstrap": "only with --bootstrap: intervals from refits of recordings drawn again (draws in bootstrap.nc)",
+    "profile": "only with --profile: intervals of parameters held while all else is fitted again",
 }
 
 DIAGNOSIS = {
@@ -113,6 +115,15 @@ INNER = {
     "next_experiment.drive.periods": "settled periods",
     "next_experiment.channels": "what to measure",
     "next_experiment.separates": "lists [first, second, probability that this recording tells them apart]",
+    "bootstrap.kind": "parametric (noise from its model) or blocks (periods of the recordings)",
+    "bootstrap.draws": "refits",
+    "bootstrap.settled": "those that settled; the others are left out",
+    "bootstrap.level": "of the percentile intervals",
+    "bootstrap.seed": "of the draws",
+    "bootstrap.parameters": "every free scalar parameter: name -> low, high, mean and deviation over the draws; estimate, stderr, unit of the fit",
+    "profile.level": "of the intervals",
+    "profile.parameters": "name -> low, high, low_found, high_found (false: a bound came first, or flat), estimate, stderr, unit, points",
+    "profile.parameters.*.points": "[value, 2 (cost - least cost)] of every refit",
 }
 
 MODEL = {

@@ -1,0 +1,100 @@
+"""What commands that scale share: where the work runs, the checkpoint, intervals of a fit, fleets."""
+
+import json
+from pathlib import Path
+
+from magjax.errors import ConfigurationError
+
+
+def add_where(p, what: str) -> None:
+    """Options for where the chunks run; `what` the checkpoint keeps."""
+    p.add_argument("--workers", type=int, metavar="N", help="processes that share the work (default: this process alone)")
+    p.add_argument("--scheduler", metavar="ADDRESS", help="dask scheduler that shares out the work (tcp://host:8786)")
+    p.add_argument("--checkpoint", metavar="FILE", help=f"keep {what} in this file; a command that was killed goes on from it")
+
+
+def add_intervals(p) -> None:
+    """Options of `fit` that ask for many fits."""
+    p.add_argument("--bootstrap", type=int, metavar="N", help="intervals from N refits of recordings drawn again")
+    p.add_argument("--bootstrap-kind", choices=("parametric", "blocks"), default="parametric", help="noise from its model, or from the recorded periods")
+    p.add_argument("--profile", metavar="NAMES", help="profile-likelihood intervals: R_eddy,xi or all")
+    p.add_argument("--fleet", nargs="+", metavar="DIR", help="one fit a folder of recordings; a table of all in --out")
+    add_where(p, "what the bootstrap or the fleet has done")
+
+
+def executor_of(options):
+    """The `executor=` that the options name."""
+    if options.workers is not None and options.scheduler:
+        raise ConfigurationError("give --workers or --scheduler, not both")
+    if options.workers is not None and options.workers < 1:
+        raise ConfigurationError(f"--workers {options.workers}; give 1 or more")
+    if options.scheduler:
+        return f"dask:{options.scheduler}"
+    return f"processes:{options.workers}" if options.workers is not None else None
+
+
+def check_intervals(options) -> None:
+    """Refuse what cannot work before the fit takes its time."""
+    executor_of(options)
+    if options.bootstrap is not None and options.bootstrap < 2:
+        raise ConfigurationError(f"--bootstrap {options.bootstrap}; give 2 or more, 200 for 95 % intervals")
+    if options.fleet and (options.bootstrap or options.profile or options.model):
+        raise ConfigurationError("--fleet goes with neither --bootstrap, --profile nor --model; fit one folder by itself for these")
+    if options.fleet and options.recordings:
+        raise ConfigurationError(f"--fleet takes folders after it and no recordings beside it ({options.recordings[0]})")
+    if not options.fleet and not options.recordings:
+        raise ConfigurationError("give recordings, or --fleet with one folder an actuator; see magjax fit --help")
+
+
+def intervals(result, options, folder, progress):
+    """Bootstrap and profile of a fit as asked: (entries for fit.json, text)."""
+    content, texts = {}, []
+    executor = executor_of(options)
+    if options.bootstrap is not None:
+        from fitting.scale import bootstrap_intervals
+
+        found = bootstrap_intervals(
+            result, options.bootstrap, kind=options.bootstrap_kind, seed=options.seed, executor=executor, checkpoint=options.checkpoint, progress=progress
+        )
+        content["bootstrap"] = found.as_dict()
+        texts += [str(found), f"  {found.outcome}"]
+        if folder:
+            found.dataset().to_netcdf(folder / "bootstrap.nc", engine="h5netcdf")
+    if options.profile:
+        from fitting.scale import profile_intervals
+
+        names = None if options.profile == "all" else options.profile.split(",")
+        found = profile_intervals(result, names, executor=executor, progress=progress)
+        content["profile"] = found.as_dict()
+        texts.append(str(found))
+    return content, "\n".join(texts)
+
+
+def run_fleet(options, choices, folder, progress) -> int:
+    """magjax fit --fleet: fleet.csv and fleet.nc in the folder, a result folder for each actuator in it."""
+    from fitting.result import write_atomically
+    from fitting.scale import fit_fleet
+
+    folders = [f for f in options.fleet if Path(f).is_dir()]
+    with progress:
+        fleet = fit_fleet(
+            folders, options.bench, choices=choices, executor=executor_of(options), checkpoint=options.checkpoint,
+            progress=progress, models=bool(folder or options.checkpoint),
+        )  # fmt: skip
+    if folder:
+        write_atomically(folder / "fleet.csv", fleet.csv())
+        fleet.dataset().to_netcdf(folder / "fleet.nc", engine="h5netcdf")
+        for row in fleet.rows:
+            if row["status"] != "failed":
+                own = folder / row["name"]
+                own.mkdir(exist_ok=True)
+                write_atomically(own / "fit.json", json.dumps(row["fit"], indent=1))
+                write_atomically(own / "model.json", json.dumps(row["model"]))
+    if options.json:
+        print(json.dumps([{k: v for k, v in row.items() if k not in ("fit", "model")} for row in fleet.rows]))
+    else:
+        print(fleet)
+        print(f"  {fleet.outcome}")
+        if folder:
+            print(f"\nresults in {folder} (fleet.csv, fleet.nc, a folder for each actuator)")
+    return 0 if fleet.count("fitted") == len(fleet.rows) else 4
