@@ -5,7 +5,7 @@ import numpy as np
 from magjax.preisach.memory import nesting
 from magjax.simulate import simulate
 
-from .model import Predictor
+from .model import Predictor, predicted_lines
 from .spectra import evaluate_lines, reduce_recording
 
 
@@ -17,7 +17,7 @@ def prediction(actuator, recording, bench):
         return np.asarray(signals.reading), measured, None
     s = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
     corners = int(4 * np.ceil(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) / 4))
-    lines = np.asarray(Predictor.build([s], 500, 40, 4, corners)(actuator))[0]
+    lines = np.asarray(predicted_lines(Predictor.build([s], 500, 40, 4, corners), actuator))[0]
     phases = np.arange(s.samples) * s.dt * s.frequency
     predicted = evaluate_lines(lines, phases)
     measured = measured[: s.samples]

@@ -17,7 +17,7 @@ from .experiments import next_experiment
 from .fit import REFINE_BETWEEN, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
 from .locate import where
-from .screen import screen
+from .screen import offset_score, screen
 from .setup import Choices
 
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
@@ -108,6 +108,8 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
 def _sensor_zero(recordings, bench, base, actuator, held, choices, progress):
     """A sensor whose zero is not the rod's rest: adopted as part of the base only if that alone meets the noise."""
     if bench.output != "displacement" or base.chi2_per_sample < 3 or "sensor.offset" in bench.free:
+        return base, None
+    if offset_score(base.problem, base.refined) ** 2 < 0.5 * (chi2_of(base) - base.data_count):  # it cannot explain the misfit
         return base, None
     freed = fit(recordings, bench, actuator=actuator, extra=(*held, "sensor.offset"), choices=choices, progress=progress)
     if freed.chi2_per_sample > SILENT_CHI2:

@@ -15,6 +15,7 @@ from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spect
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 FINER_KNOTS = ((26, 18), (36, 24))
+FINER_TAKES = 0.7  # of the excess may be left
 REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
@@ -87,9 +88,13 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
         started = _resample(problem, solution, spectra, actuator, bench, names, finer)
         trial_problem, z = started
         z = _with_parameters(trial_problem, z, problem, solution)
-        trial = solve(trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("finer density", k, c))
-        excess = [max(s.chi2 - 0.95 * count, 0.0) for s in (solution, trial)]
-        if not (excess[1] < 0.7 * excess[0] and trial.chi2 < solution.chi2 - 25):
+        # a finer density must take 30 % of the excess, and five standard deviations
+        target = min(0.95 * count + FINER_TAKES * max(solution.chi2 - 0.95 * count, 0.0), solution.chi2 - 25)
+        trial = solve(
+            trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, target=target,
+            progress=lambda k, c: report("finer density", k, c),
+        )  # fmt: skip
+        if not trial.chi2 < target:
             break
         problem, solution, choices = trial_problem, trial, finer
     return problem, solution, choices

@@ -9,7 +9,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from .model import Predictor
+from .model import Predictor, predicted_lines
 from .spectra import fit_lines
 
 
@@ -31,7 +31,7 @@ def solver_floor(problem, solution) -> float:
     grids = [d.shape[1] for d in fine.drives]
     actuator = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
     twice = Predictor.build(problem.spectra, 2 * min(grids), fine.harmonics, fine.periods, fine.corners)
-    change = np.asarray(twice(actuator) - fine(actuator))[:, 1:]
+    change = np.asarray(predicted_lines(twice, actuator) - predicted_lines(fine, actuator))[:, 1:]
     return float(np.sqrt(np.mean(2 * np.sum(np.abs(change) ** 2, axis=1))))
 
 

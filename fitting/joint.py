@@ -10,6 +10,8 @@ import time
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import structural_rank
 
 from .model import Layout, Predictor, Target, whitened
 from .solver import damped_step, jacobian
@@ -95,7 +97,7 @@ def evidence_weights(layout: Layout, z, normal, weights):
         D = np.asarray(D)
         roughness = float(np.sum((D @ z[:n]) ** 2))
         D = D[:, active[:n]]
-        rank = np.linalg.matrix_rank(D)
+        rank = structural_rank(csr_array(D))
         taken = weight * np.einsum("ij,jk,ik->", D, S[:n, :n][np.ix_(active[:n], active[:n])], D)
         gamma = max(rank - taken, 0.5)
         new.append(np.clip(gamma / max(roughness, 1e-12), *WEIGHT_RANGE))
@@ -115,12 +117,13 @@ def prior_matrix(problem: Problem, weights) -> np.ndarray:
     return matrix
 
 
-def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None) -> Solution:
+def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None, target: float = np.inf) -> Solution:
     """Minimise from z, one Jacobian and a few trial dampings a step.
 
     The steps are those of `ProjectedLevenbergMarquardt`, driven from Python with the two compiled functions that the
     screening uses too (half the compilation). `progress(step, chi2 per datum)` is called after each Jacobian; Ctrl-C
-    keeps what was reached.
+    keeps what was reached. `target`: a chi2 that must be reached to be of use; once four times the promised fall cannot
+    lead there the iteration ends.
     """
     layout, count = problem.layout, problem.data_count
     bounded = jnp.asarray(layout.nonnegative)
@@ -151,6 +154,8 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
             chi2 = float(residual @ residual)
             if progress is not None:
                 progress(taken, chi2 / count)
+            if taken > 3 and chi2 - 8 * decrement > target:
+                break
             settled = decrement < 0.5 + 1e-4 * cost
             if evidence and chi2 / count < 20:
                 found = evidence_weights(layout, z, normal, weights)

@@ -165,6 +165,12 @@ class Predictor(eqx.Module):
         return jnp.concatenate(parts)[order]
 
 
+@eqx.filter_jit
+def predicted_lines(predictor: Predictor, actuator):
+    """`predictor(actuator)` compiled: (recordings, harmonics + 1), complex."""
+    return predictor(actuator)
+
+
 class Target(eqx.Module):
     """What the predictor must meet: measured lines, their deviations, and the prior's weights."""
 

@@ -203,12 +203,13 @@ def columns(problem, z):
     return [(c, s, np.asarray(whitened(line, zero))) for c, s, line in found]
 
 
+@eqx.filter_jit
 def _drive_change(effect, drive, dt, actuator):
     def one(d, h):
         line = Timeline(h, d.shape[0], True)
         return jax.jvp(lambda a: effect.with_amplitude(a).drive(d, line, actuator), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
-    return np.asarray(jax.vmap(one)(drive, dt))
+    return jax.vmap(one)(drive, dt)
 
 
 class Projector:
@@ -270,3 +271,13 @@ def screen(problem, solution) -> list[Candidate]:
         if effect.name not in best or abs(candidate.z) > abs(best[effect.name].z):
             best[effect.name] = candidate
     return sorted(best.values(), key=lambda c: -abs(c.z))
+
+
+def offset_score(problem, solution) -> float:
+    """z of a constant added to every reading, beside everything the base can do."""
+    projector = Projector(problem, solution)
+    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
+    ones = np.zeros(problem.target.lines.shape, complex)
+    ones[:, 0] = 1.0
+    part = projector.project(np.asarray(whitened(jnp.asarray(ones), zero)))
+    return float(-(part @ projector.residual) / max(np.linalg.norm(part), 1e-300))
