@@ -1,7 +1,7 @@
 """The next experiment: the recording that best tells rivals apart, within the bench's limits."""
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from magjax.errors import MagjaxError
 from magjax.simulate import simulate
@@ -42,7 +42,7 @@ def next_experiment(trials, spectra, bench, noise_rms: float) -> dict | None:
     if best is None:
         return None
     apart, f, A, offset = best
-    probability = float(norm.cdf(0.5 * apart))
+    probability = float(ndtr(0.5 * apart))
     unit = "A" if bench.drive == "current" else "A/m"
     channel = None
     for i, a in enumerate(trials):

@@ -80,7 +80,7 @@ def _read_csv(path):
     if not _has_rows(path, skip + 1):
         raise RecordingError(f"{path}: has a header but no samples; record again")
     try:
-        values = np.genfromtxt(path, delimiter=separator, skip_header=skip + 1, ndmin=2, comments="#", encoding="utf-8-sig")
+        values = _numbers(path, separator, skip + 1)
     except ValueError as error:
         raise RecordingError(f"{path}: rows of unequal length ({str(error).splitlines()[-1].strip()}); mend or cut them") from None
     if values.size == 0:
@@ -88,6 +88,14 @@ def _read_csv(path):
     if values.shape[1] != len(names):
         raise RecordingError(f"{path}: {len(names)} column names but {values.shape[1]} columns; mend the header row")
     return dict(zip(names, values.T, strict=True)), metadata
+
+
+def _numbers(path, separator, skip):
+    """The rows of numbers: by the fast reader, or by the patient one, which takes empty cells for NaN."""
+    try:
+        return np.loadtxt(path, delimiter=separator, skiprows=skip, ndmin=2, comments="#", encoding="utf-8-sig")
+    except ValueError:
+        return np.genfromtxt(path, delimiter=separator, skip_header=skip, ndmin=2, comments="#", encoding="utf-8-sig")
 
 
 def _has_rows(path, skip) -> bool:

@@ -119,7 +119,8 @@ def simulate(actuator, current, dt: float, *, periodic: bool = False, settle: in
     if not periodic:
         actuator = dataclasses.replace(actuator, hysteresis=actuator.hysteresis.rested())
     needed = _corners(actuator, drive, periodic) if corners is None else corners
-    signals = _run(actuator, jnp.asarray(drive), dt, (settle + 1) if periodic else 0, needed, scheme)
+    # dt as an array: a Python number would be part of the program, compiled anew for every frequency
+    signals = _run(actuator, jnp.asarray(drive), jnp.asarray(dt, float), (settle + 1) if periodic else 0, needed, scheme)
     if bool(signals.overflow):
         raise ConfigurationError(f"the drive leaves more than {needed} nested corners in the memory; raise corners")
     _refuse_outside(actuator, signals)
