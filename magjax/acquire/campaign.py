@@ -13,6 +13,8 @@ Other kinds: multisine (frequency list, amplitude, offset), minor_loops (carrier
 """
 
 import dataclasses
+import glob
+import hashlib
 import json
 import tomllib
 from pathlib import Path
@@ -23,6 +25,7 @@ from .. import waveforms
 from ..errors import ConfigurationError, MagjaxError
 from .export import export_log
 from .link import ask_hello, open_port
+from .log import Log
 from .order import Order
 from .process import record
 
@@ -34,6 +37,7 @@ KEYS = {
     "reversal_curves": ("low", "high", "count", "rate"),
 }
 SETTINGS = {"samples": 500, "periods": 8, "settle": 4, "demagnetize": True, "tries": 3}
+POSITIVE = ("frequency", "amplitude", "carrier", "modulation", "count", "rate")
 FEWEST = 40  # samples a period that a loop needs
 
 
@@ -54,6 +58,11 @@ class Entry:
         """Largest absolute current, A."""
         return Order("", "", drive=self.drive).peak()
 
+    def same(self) -> str:
+        """What tells this drive from another of the same name, for the log's start event."""
+        content = json.dumps([self.drive, self.rate, self.samples], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
@@ -67,10 +76,10 @@ class Plan:
 def read_plan(path) -> Plan:
     """A study file; raises `ConfigurationError` naming the key and the mend."""
     try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ConfigurationError(f"plan {path}: {error.strerror or error}; give a TOML file with [[drives]]") from None
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"plan {path}: not valid TOML ({error})") from None
     drives = content.pop("drives", [])
     for key, value in content.items():
@@ -78,19 +87,33 @@ def read_plan(path) -> Plan:
             raise ConfigurationError(f"plan {path}: {key} is unknown; known are {', '.join(SETTINGS)} and [[drives]]")
         if type(value) is not type(SETTINGS[key]) or (not isinstance(value, bool) and value < (0 if key == "settle" else 1)):
             raise ConfigurationError(f"plan {path}: {key} = {value!r}; write it like {SETTINGS[key]!r}".replace("True", "true"))
-    if not drives:
-        raise ConfigurationError(f"plan {path}: holds no [[drives]]; name at least one")
+    if not isinstance(drives, list) or not drives or not all(isinstance(row, dict) for row in drives):
+        raise ConfigurationError(f"plan {path}: holds no [[drives]] (in double brackets); name at least one")
     for row in drives:
-        kind = row.get("kind", "sine")
-        if kind not in KEYS:
-            raise ConfigurationError(f'plan {path}: kind = "{kind}" is unknown; known are {", ".join(KEYS)}')
-        for key in row:
-            if key != "kind" and key not in KEYS[kind]:
-                raise ConfigurationError(f"plan {path}: {key} is unknown for a {kind}; it takes {', '.join(KEYS[kind])}")
-        for key in KEYS[kind]:
-            if key not in row and key not in ("offset", "depth", "decay"):
-                raise ConfigurationError(f"plan {path}: a {kind} needs {key}")
+        _check_row(path, row)
     return Plan({**SETTINGS, **content}, tuple(drives), str(path))
+
+
+def _check_row(path, row):
+    kind = row.get("kind", "sine")
+    if kind not in KEYS:
+        raise ConfigurationError(f'plan {path}: kind = "{kind}" is unknown; known are {", ".join(KEYS)}')
+    for key in row:
+        if key != "kind" and key not in KEYS[kind]:
+            raise ConfigurationError(f"plan {path}: {key} is unknown for a {kind}; it takes {', '.join(KEYS[kind])}")
+    for key in KEYS[kind]:
+        if key not in row:
+            if key not in ("offset", "depth", "decay"):
+                raise ConfigurationError(f"plan {path}: a {kind} needs {key}")
+            continue
+        many = kind == "sine" or (kind, key) == ("multisine", "frequency")
+        values = row[key] if many and isinstance(row[key], list) else [row[key]]
+        good = [isinstance(v, (int, float)) and not isinstance(v, bool) and np.isfinite(v) for v in values]
+        if not good or not all(good) or (key in POSITIVE and min(values) <= 0):
+            what = "a number above zero" if key in POSITIVE else "a number"
+            raise ConfigurationError(
+                f"plan {path}: {key} = {row[key]!r} of a {kind}; give {what}{', or a list of such' if many else ''}"
+            )
 
 
 def entries(plan: Plan, rate_max: float = 2e5) -> list[Entry]:
@@ -181,18 +204,26 @@ class Campaign:
     say: object = print
     live: object = None
     amplifier: str | None = None
+    hello: object = None
 
     def rate_max(self) -> float:
         """What the device samples at most, Hz."""
         port = open_port(self.port, self.baud)
         try:
-            return ask_hello(port, 5.0).rate_max
+            self.hello = ask_hello(port, 5.0)
         finally:
             port.close()
+        return self.hello.rate_max
 
     def check_limits(self, found) -> None:
-        """Refuse the whole plan before anything moves."""
+        """Refuse the whole plan before anything moves: what the bench does not bear, and what the device cannot do."""
         for entry in found:
+            order = Order(
+                self.port, "", entry.rate, entry.samples, entry.settle_samples, entry.drive, self.baud, give_up_s=self.give_up_s
+            )
+            order.check_numbers()
+            if self.hello:
+                order.check(self.hello)
             if self.limit and entry.peak > self.limit * (1 + 1e-9):
                 raise ConfigurationError(
                     f"the plan's drive {entry.text} reaches {entry.peak:.4g} A where the limit is {self.limit:g} A; lower it, or raise limits.current_A"
@@ -206,25 +237,31 @@ class Campaign:
             self.say(f"{k + 1} of {len(found)}: {entry.text}")
             row = self.one(entry)
             rows.append(row)
-            place.write_text(json.dumps({"recordings": rows}, indent=1))
+            partial = place.with_name(place.name + ".part")
+            partial.write_text(json.dumps({"recordings": rows}, indent=1))
+            partial.replace(place)
             if row["status"] in (5, 130):
                 break
         return rows
 
     def one(self, entry: Entry) -> dict:
-        """One entry: recorded until it passes its check, `tries` times at most; a recording that is there and good is kept."""
+        """One entry: recorded until it passes its check, `tries` times at most; a recording that is there and good is kept.
+
+        What is in the way is put aside as .bad or, where it holds another drive, as .other.
+        """
         path = self.folder / f"{entry.name}.mjlog"
-        if path.exists() and not self.problems(path, entry):
+        if path.exists() and not self._another(path, entry) and not self.problems(path, entry):
             return {"name": entry.name, "file": str(path), "status": 0, "problems": [], "tries": 0, "text": entry.text}
         problems, settle = [], entry.settle_samples
         for attempt in range(1, self.settings["tries"] + 1):
             if path.exists():
-                bad = len(list(self.folder.glob(f"{entry.name}.bad*")))
-                path.rename(self.folder / f"{entry.name}.bad{bad}.mjlog")
+                why = "other" if self._another(path, entry) else "bad"
+                count = len(list(self.folder.glob(f"{glob.escape(entry.name)}.{why}*")))
+                path.rename(self.folder / f"{entry.name}.{why}{count}.mjlog")
             order = Order(
                 self.port, str(path), entry.rate, entry.samples, settle, entry.drive, self.baud, self.limit, durable=self.durable,
                 give_up_s=self.give_up_s, amplifier=self.amplifier, demagnetize=bool(self.settings["demagnetize"]), header=self.header,
-                about={"settle_samples": settle, "drive": entry.text} | ({"frequency_Hz": entry.frequency} if entry.frequency else {}),
+                about={"settle_samples": settle, "drive": entry.text, "entry": entry.same()} | ({"frequency_Hz": entry.frequency} if entry.frequency else {}),
                 loop_samples=min(entry.samples, 4000),
             )  # fmt: skip
             end = record(order, self.live)
@@ -251,6 +288,15 @@ class Campaign:
             "tries": attempt,
             "text": entry.text,
         }
+
+    @staticmethod
+    def _another(path, entry) -> bool:
+        """Does a log of this name hold another drive? (The plan was changed since.)"""
+        try:
+            starts = [e for e in Log(path).events if e["event"] == "start"]
+        except MagjaxError:
+            return False
+        return any(e.get("entry", entry.same()) != entry.same() for e in starts)
 
     def problems(self, path, entry: Entry) -> list[str]:
         """Why a recording is not fit to use; empty where it is."""

@@ -42,11 +42,7 @@ class Device:
     def hello(self) -> bytes:
         """HELLO as it stands now."""
         channels = [{k: c[k] for k in ("name", "unit", "scale", "offset")} for c in self.response.channels]
-        last = (
-            None
-            if self.last is None
-            else dict(zip(p.LAST, self._last_row(), strict=True))
-        )
+        last = None if self.last is None else dict(zip(p.LAST, self._last_row(), strict=True))
         return p.hello_packet({
             "protocol": p.VERSION, "device": self.name, "firmware": "magjax emulator 1", "boot_id": self.boot_id, "rate_max_Hz": self.rate_max,
             "frame_samples": self.frame_samples, "clock_bits": self.clock_bits, "watchdog_s": self.watchdog_s, "channels": channels,

@@ -67,8 +67,15 @@ class PtyLine(Line):
         self.place = None
         if self.link:
             self.place = Path(f"{self.link}{self.number}")
-            self.place.unlink(missing_ok=True)
-            self.place.symlink_to(self.name)
+            if self.place.exists() and not self.place.is_symlink():
+                raise DeviceError(f"--link {self.link}: {self.place} is there and no link; choose another name")
+            try:
+                self.place.unlink(missing_ok=True)
+                self.place.symlink_to(self.name)
+            except OSError as error:
+                raise DeviceError(
+                    f"--link {self.link}: {self.place} cannot be made ({error.strerror}); choose another name"
+                ) from None
             self.name = str(self.place)
         self.out.clear()
 
@@ -119,6 +126,8 @@ class TcpLine(Line):
 
     def __init__(self, port: int, baud=None):
         super().__init__(baud)
+        if not 0 <= port < 65536:
+            raise DeviceError(f"TCP port {port}: not within 0 .. 65535; choose another, or 0 for a free one")
         try:
             self.server = socket.create_server(("127.0.0.1", port))
         except OSError as error:

@@ -13,6 +13,9 @@ import numpy as np
 from ..errors import ConfigurationError
 
 
+PROBABILITIES = ("drop", "flip", "merge", "duplicate")
+
+
 @dataclasses.dataclass
 class Faults:
     """Probabilities and single events; see the module."""
@@ -64,4 +67,6 @@ def read_faults(words, seed: int = 0) -> Faults:
             values[name] = None
         if name not in known or values[name] is None or not 0 <= values[name] < 1e12:
             raise ConfigurationError(f'"{word}" is no fault; write one of {", ".join(known)} with =VALUE')
+        if name in PROBABILITIES and values[name] > 1:
+            raise ConfigurationError(f'"{word}": {name} is a probability; give 0 to 1')
     return Faults(**values, seed=seed)

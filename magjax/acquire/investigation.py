@@ -28,6 +28,10 @@ class Budget:
     recordings: int = 20
     minutes: float = 30.0
 
+    def __post_init__(self):
+        if self.recordings < 2 or not 0 < self.minutes < float("inf"):
+            raise ConfigurationError(f"--recordings {self.recordings} --minutes {self.minutes:g}: give two or more, and some time")
+
 
 class Investigation:
     """One investigation in the campaign's folder. `plan`: a `Plan` for the first study, None for the usual one."""
@@ -39,14 +43,13 @@ class Investigation:
         if self.path.exists():
             try:
                 self.state = json.loads(self.path.read_text(encoding="utf-8"))
-            except ValueError as error:
+                about, _ = self.state["bench"], [self.state[k] for k in ("extra", "steps", "spent_s")]
+            except (ValueError, KeyError, TypeError, OSError) as error:
                 raise ConfigurationError(
                     f"{self.path}: cannot be read ({error}); remove it to begin anew, the recordings are kept"
                 ) from None
-            if self.state["bench"] != campaign.bench.name:
-                raise ConfigurationError(
-                    f"{self.path} is about bench {self.state['bench']}; give another --out for {campaign.bench.name}"
-                )
+            if about != campaign.bench.name:
+                raise ConfigurationError(f"{self.path} is about bench {about}; give another --out for {campaign.bench.name}")
 
     def run(self) -> dict:
         """Go on until it is settled or the budget is spent; the content of investigation.json."""
@@ -62,6 +65,9 @@ class Investigation:
             stopped = next((r for r in rows if r["status"] in (5, 130)), None)
             if stopped:
                 return self._end("interrupted" if stopped["status"] == 130 else "device", stopped["problems"][0])
+            if not any(e.name in files for e in [*first, *extra]):
+                why = next((r["problems"][0] for r in rows if r["problems"]), "the budget leaves no recording")
+                return self._end("no usable recording", f"Nothing fit to use was recorded: {why}.")
             step = self._step(
                 [files[e.name] for e in [*first, *extra] if e.name in files], [files[e.name] for e in checks if e.name in files]
             )

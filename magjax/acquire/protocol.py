@@ -109,7 +109,9 @@ def read_hello(payload: bytes) -> Hello:
             float(content.get("watchdog_s", 0.0)), bool(content.get("running", False)), content.get("last"), content,
         )  # fmt: skip
         if hello.drive is not None:
-            hello = dataclasses.replace(hello, drive={**hello.drive, **{k: float(hello.drive[k]) for k in ("scale", "limit", "table")}})
+            hello = dataclasses.replace(
+                hello, drive={**hello.drive, **{k: float(hello.drive[k]) for k in ("scale", "limit", "table")}}
+            )
         if hello.last is not None:
             hello = dataclasses.replace(hello, last={k: int(hello.last[k]) for k in LAST})
     except (ValueError, TypeError) as error:
@@ -127,7 +129,9 @@ def read_hello(payload: bytes) -> Hello:
         if not 0 < value < np.inf:
             raise DeviceError(f"the device's HELLO gives {name} = {value:g}; mend the firmware (docs/protocol.md)")
     if not all(np.isfinite(c.offset) for c in channels) or not 0 <= hello.watchdog_s < np.inf:
-        raise DeviceError("the device's HELLO gives an offset or watchdog_s that is no number; mend the firmware (docs/protocol.md)")
+        raise DeviceError(
+            "the device's HELLO gives an offset or watchdog_s that is no number; mend the firmware (docs/protocol.md)"
+        )
     names = [c.name for c in channels]
     if len(set(names)) < len(names):
         raise DeviceError(f"the device names two channels alike ({', '.join(names)}); mend the firmware (docs/protocol.md)")

@@ -299,7 +299,9 @@ class Recorder:
         end = time.monotonic() + self.order.give_up_s
         while time.monotonic() < end:
             for name in candidates(self.order.port):
-                port = try_device(name, self.order.baud, None if self.order.text is not None else self.hello, self.order.boot_wait_s / 5)
+                port = try_device(
+                    name, self.order.baud, None if self.order.text is not None else self.hello, self.order.boot_wait_s / 5
+                )
                 if port is None:
                     continue
                 self.port, hello = port[0], port[1] or self.hello
@@ -392,4 +394,3 @@ class Recorder:
             "damaged_frames": self.adapter.damaged, "bytes": self.log.written, "link_bytes": self.adapter.received, "segment": self.segment,
             "disk_free": free_room(self.order.path), "loop": loop, "host_time": time.time(),
         })  # fmt: skip
-

@@ -105,9 +105,13 @@ def effect_of(name: str, parameters: dict):
     if name not in classes:
         raise ConfigurationError(f'no effect "{name}"; the catalogue has {", ".join(classes)}')
     known = classes[name].parameters()
-    for key in parameters:
+    for key, value in parameters.items():
         if key not in known:
             raise ConfigurationError(f'effect {name} has no parameter "{key}"; it has {", ".join(known)}')
+        if not known[key].low <= value <= known[key].high or not np.isfinite(value):
+            raise ConfigurationError(
+                f"effect {name}: {key} = {value:g}; give {known[key].low:g} to {known[key].high:g} {known[key].unit}"
+            )
     amplitude = classes[name].amplitude
     if amplitude not in parameters:
         typical = known[amplitude].typical or (known[amplitude].scale,) * 2

@@ -55,8 +55,8 @@ def main(arguments=None) -> int:
         return 2
     from magjax.errors import MagjaxError
 
-    module = importlib.import_module(COMMANDS[arguments[0]][0])
     try:
+        module = importlib.import_module(COMMANDS[arguments[0]][0])
         return module.run(arguments[0], arguments[1:]) or 0
     except MagjaxError as error:
         print(f"magjax {arguments[0]}: {error}", file=sys.stderr)

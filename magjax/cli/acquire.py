@@ -88,6 +88,16 @@ def _emulate(options) -> int:
     from magjax.acquire.emulator import Emulator, PtyLine, TcpLine
     from magjax.acquire.faults import read_faults
 
+    ranges = {
+        "--frame": (options.frame, 1, 4096),
+        "--rate-max": (options.rate_max, 1e-3, 4e6),
+        "--watchdog": (options.watchdog, 1e-3, 1e6),
+    }
+    if options.baud is not None:
+        ranges["--baud"] = (options.baud, 1.0, 1e10)
+    for name, (value, low, high) in ranges.items():
+        if not low <= value <= high:
+            raise ConfigurationError(f"{name} {value:g}: give {low:g} to {high:g}")
     faults = read_faults(options.fault, options.seed)
     response, limit = _response(options, faults)
     wrapping = {"first_seq": 2**32 - 20, "clock_us": 2**32 - 300_000, "clock_bits": 32} if faults.wrap else {}
@@ -195,7 +205,9 @@ def _run_single(options, arguments) -> int:
     path = Path(options.out)
     writable(path)
     if path.suffix.lower() != ".mjlog":
-        raise ConfigurationError(f"{path}: a log is read by its ending; write {path.with_suffix('.mjlog').name} (and --export for others)")
+        raise ConfigurationError(
+            f"{path}: a log is read by its ending; write {path.with_suffix('.mjlog').name} (and --export for others)"
+        )
     if path.exists() and not options.resume:
         raise ConfigurationError(f"{path}: exists already; choose another name or add --resume")
     if options.export:

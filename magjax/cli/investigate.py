@@ -6,7 +6,7 @@ import sys
 from .acquire import _record_options, campaign
 from .runtime import parser, prepare_jax
 
-STATUS = {"settled": 0, "interrupted": 130, "device": 5}
+STATUS = {"settled": 0, "interrupted": 130, "device": 5, "no usable recording": 3}
 
 
 def run(_command: str, arguments: list[str]) -> int:

@@ -88,6 +88,15 @@ def test_a_bad_recording_is_repeated(emulate, study, tmp_path):
         (("count = 4", ""), "needs count"),
         (("frequency = [20, 100]", "frequency = [20, 9000]"), "samples a period"),
         (("[[drives]]", "[[drive"), "not valid TOML"),
+        (("frequency = [20, 100]", 'frequency = "fast"'), "frequency = 'fast' of a sine; give a number above zero"),
+        (("frequency = [20, 100]", "frequency = [20, nan]"), "give a number above zero, or a list"),
+        (("frequency = [20, 100]", "frequency = []"), "give a number above zero, or a list"),
+        (("amplitude = 0.5\noffset", "amplitude = -0.5\noffset"), "amplitude = -0.5 of a sine"),
+        (("offset = 0.1", "offset = true"), "offset = True of a sine; give a number"),
+        (("amplitude = 0.4", "amplitude = [0.4, 0.5]"), "amplitude = [0.4, 0.5] of a multisine; give a number above zero"),
+        (("modulation = 10", "modulation = 0"), "modulation = 0 of a minor_loops"),
+        (("frequency = 50", "frequency = [50, 60]"), "of a decaying; give a number above zero"),
+        (("samples = 200", "drives = 3"), "not valid TOML"),
     ],
 )
 def test_a_bad_plan_is_refused_in_one_line(study, tmp_path, capsys, change, words):
@@ -95,6 +104,35 @@ def test_a_bad_plan_is_refused_in_one_line(study, tmp_path, capsys, change, word
     assert main(["record", "/dev/ttyNONE", "--plan", str(study), "--out", str(tmp_path / "out")]) == 2
     text = capsys.readouterr().err
     assert words in text and text.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["drives = 3", "drives = [1, 2]", '[drives]\nkind = "sine"', ""])
+def test_a_plan_without_a_list_of_drives(tmp_path, text):
+    (tmp_path / "p.toml").write_text(text)
+    with pytest.raises(ConfigurationError, match="double brackets"):
+        read_plan(tmp_path / "p.toml")
+    (tmp_path / "p.toml").write_bytes(b"# \xe9")
+    with pytest.raises(ConfigurationError, match="not valid TOML"):
+        read_plan(tmp_path / "p.toml")
+
+
+def test_a_changed_plan_is_recorded_anew(emulate, study, tmp_path):
+    """Same name, another drive: what is there is put aside, not taken for it."""
+    port = emulate("--fast")["port"]
+    made = Campaign(
+        port, load_bench("aa-050h"), tmp_path, 0.9, {**SETTINGS, **read_plan(study).settings}, {}, say=lambda text: None
+    )
+    row = lambda: made.run(entries(read_plan(study))[2:3])[0]
+    assert (row()["tries"], row()["tries"]) == (1, 0)
+    study.write_text(STUDY.replace("amplitude = 0.4", "amplitude = 0.41"))
+    assert (row()["tries"], row()["tries"]) == (1, 0)
+    assert len(list(tmp_path.glob("*.other0.mjlog"))) == 1 and not list(tmp_path.glob("*.bad*"))
+
+
+def test_what_the_device_cannot_do_is_refused_before_anything_moves(emulate, study, tmp_path, capsys):
+    study.write_text(STUDY.replace("count = 4", "count = 400").replace("rate = 20", "rate = 0.01"))
+    assert main(["record", emulate("--fast")["port"], "--plan", str(study), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "the device holds 65536" in capsys.readouterr().err and not list((tmp_path / "out").glob("*.mjlog"))
 
 
 def test_a_plan_at_a_missing_port_is_status_5(study, tmp_path, capsys):

@@ -65,6 +65,21 @@ def test_a_budget_of_minutes_ends_it(emulate, tmp_path):
     assert state["ended"]["how"] == "budget spent" and len(asked) == 1
 
 
+def test_nothing_usable_and_wrong_budgets_are_told(emulate, tmp_path, monkeypatch):
+    analyse, asked = scripted()
+    made = campaign(emulate("--fast")["port"], tmp_path)
+    monkeypatch.setattr(Campaign, "problems", lambda self, path, entry: ["the sensor is unplugged"])
+    state = Investigation(made, analyse, Budget(4, 10), PLAN).run()
+    assert state["ended"]["how"] == "no usable recording" and "sensor is unplugged" in state["ended"]["message"] and not asked
+    for wrong in ((0, 10), (5, 0), (5, float("nan"))):
+        with pytest.raises(ConfigurationError, match="give two or more"):
+            Budget(*wrong)
+    for content in ("[]", "{}", "torn {"):
+        (tmp_path / "investigation.json").write_text(content)
+        with pytest.raises(ConfigurationError, match="remove it to begin anew"):
+            Investigation(made, analyse, Budget(4, 10), PLAN)
+
+
 def log_of(path, frequency, answer, noise=2.0):
     """A log whose current is `answer`(w) times its command, in counts of 5e-5 A."""
     width, periods = 200, 6

@@ -247,7 +247,10 @@ def test_a_foreign_device_is_one_line_and_status_5(tmp_path, hello, words):
     far = FakeDevice(lambda chunk: encode(hello) if hello else b"garbage")
     end = record(
         Order(
-            far.name_of_port, str(tmp_path / "a.mjlog"), drive={"kind": "table", "values": [0.1] * 9, "repeats": 0}, boot_wait_s=30.0 if hello else 1.0
+            far.name_of_port,
+            str(tmp_path / "a.mjlog"),
+            drive={"kind": "table", "values": [0.1] * 9, "repeats": 0},
+            boot_wait_s=30.0 if hello else 1.0,
         )
     )
     far.end()
@@ -329,13 +332,25 @@ def test_bad_input_is_one_line(emulate, tmp_path, capsys):
     with open(port):
         done = magjax("record", port, "--out", str(tmp_path / "b.mjlog"))
         assert done.returncode == 5 and "in use by process" in done.stderr
+    (tmp_path / "tty0").write_text("a file of the user's")
     for arguments in (
+        ["--fault", "drop=2"],
+        ["--frame", "0"],
+        ["--rate-max", "nan"],
+        ["--baud", "0"],
+        ["--watchdog", "-1"],
+        ["--hide", "sensor_lag:tau=-1"],
+        ["--hide", "sensor_lag:tau=nan"],
         ["--fault", "flood=3"],
         ["--hide", "gremlin"],
         ["--hide", "sensor_lag:tau=much"],
         ["--bench", "plain", "--hide", "sensor_lag"],
     ):
-        assert main(["emulate", *arguments]) == 2
+        assert main(["emulate", "--as-stated", *arguments]) == 2, arguments
         assert capsys.readouterr().err.count("\n") == 1
+    for arguments in (["--tcp", "99999"], ["--link", str(tmp_path / "tty")], ["--link", str(tmp_path / "absent" / "tty")]):
+        assert main(["emulate", "--bench", "plain", *arguments]) == 5, arguments
+        assert capsys.readouterr().err.count("\n") == 1
+    assert (tmp_path / "tty0").read_text() == "a file of the user's"
     assert main(["ports", "--json"]) == 0
     json.loads(capsys.readouterr().out)
