@@ -69,9 +69,10 @@ def run_demo(folder, seed: int = 0, progress=None):
         write_recording(folder / recording.name, recording)
     plain = fit(recordings, bench, progress=progress)
     found = diagnose(recordings, bench, check=checks, progress=progress)
-    for part, result, writer in (("fit", plain, write_fit), ("diagnosis", found, write_diagnosis)):
+    for part in ("fit", "diagnosis"):
         (folder / part).mkdir(exist_ok=True)
-        writer(folder / part, result, recordings, result.as_dict(), f"magjax demo --seed {seed}")
+    write_fit(folder / "fit", plain, recordings, plain.as_dict(), f"magjax demo --seed {seed}", progress)
+    write_diagnosis(folder / "diagnosis", found, recordings, found.as_dict(), f"magjax demo --seed {seed}", checks, progress)
     content = {"truth": TRUTH | {"effects.excess_loss.k": 25.0}, "fit": plain.as_dict(), "diagnosis": found.as_dict()}
     (folder / "truth.json").write_text(json.dumps(content["truth"]))
     return _story(plain, found, folder), content

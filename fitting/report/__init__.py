@@ -1,5 +1,6 @@
-"""Results to pages: fit.json, diagnosis.json, figures and one offline report.html."""
+"""Results to pages: fit.json, diagnosis.json, their evidence, figures, and one offline report.html."""
 
-from .page import rebuild, write_diagnosis, write_fit
+from .page import rebuild
+from .write import write_diagnosis, write_fit
 
 __all__ = ["rebuild", "write_diagnosis", "write_fit"]

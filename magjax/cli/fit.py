@@ -73,12 +73,12 @@ def run_fit(arguments) -> int:
     with Progress(options.quiet or options.json) as progress:
         result = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
         more, text = intervals(result, options, folder, progress)
-    content = result.as_dict() | more
-    content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
-    if folder:
-        from fitting.report import write_fit
+        content = result.as_dict() | more
+        content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
+        if folder:
+            from fitting.report import write_fit
 
-        write_fit(folder, result, recordings, content, _reproduce("fit", arguments))
+            write_fit(folder, result, recordings, content, _reproduce("fit", arguments), progress)
     if options.json:
         print(json.dumps(content))
     else:
@@ -106,7 +106,7 @@ def run_diagnose(arguments) -> int:
     from fitting.diagnose import Diagnosis, diagnose
     from fitting.setup import Choices
 
-    recordings = []
+    recordings, checks = [], []
     try:
         recordings = load_recordings(options.recordings, bench)
         checks = load_recordings(options.check, bench) if options.check else []
@@ -119,7 +119,8 @@ def run_diagnose(arguments) -> int:
     if folder:
         from fitting.report import write_diagnosis
 
-        write_diagnosis(folder, found, recordings, content, _reproduce("diagnose", arguments))
+        with Progress(options.quiet or options.json) as progress:
+            write_diagnosis(folder, found, recordings, content, _reproduce("diagnose", arguments), checks, progress)
     if options.json:
         print(json.dumps(content))
     else:
@@ -161,6 +162,7 @@ def run_report(arguments) -> int:
     options = p.parse_args(arguments)
     from fitting.report import rebuild
 
-    page = rebuild(Path(options.folder))
+    with Progress(options.quiet or options.json) as progress:
+        page = rebuild(Path(options.folder), progress)
     print(json.dumps({"report": str(page)}) if options.json else f"wrote {page}", file=sys.stdout)
     return 0

@@ -55,16 +55,17 @@ def analysis(bench, folder, options):
 
         from .runtime import output_folder
 
-        recordings = []
+        recordings, held = [], []
         try:
             recordings = load_recordings(files, bench)
-            found = diagnose(recordings, bench, check=load_recordings(checks, bench) if checks else [])
+            held = load_recordings(checks, bench) if checks else []
+            found = diagnose(recordings, bench, check=held)
         except RecordingError as error:
             found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
         content = found.as_dict()
         place = output_folder(folder / f"diagnosis_{number + 1}")
         write_diagnosis(
-            place, found, recordings, content, f"magjax diagnose {' '.join(str(f) for f in files)} --bench {options.bench}"
+            place, found, recordings, content, f"magjax diagnose {' '.join(str(f) for f in files)} --bench {options.bench}", held
         )
         return json.loads(json.dumps(content))
 

@@ -80,4 +80,5 @@ class Progress:
         """What is being done, at which step, with which misfit."""
         if self.status is not None:
             misfit = "" if chi2 is None else f", chi2/N = {chi2:.4g}"
-            self.status.update(f"{text}: step {step}{misfit} ({time.perf_counter() - self.begin:.0f} s)")
+            at = f": step {step}" if step else ""
+            self.status.update(f"{text}{at}{misfit} ({time.perf_counter() - self.begin:.0f} s)")

@@ -1,0 +1,273 @@
+"""The page of a diagnosis: the verdict in plain words first, what to do next, and then the grounds for it."""
+
+import json
+import math
+
+from . import found as pictures
+from . import loops, misfit, plane, tables
+from .fit_page import convergence_part, headed, sentence
+from .page import Sketch, part, section
+from .style import plain, scale_of
+
+TONES = {"nothing_missing": "good", "attributed": "good", "group": "warn", "absorbed": "warn", "unknown_at": "warn", "data_problem": "bad"}
+SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
+
+
+def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
+    """The page's words, tables and pictures; `say(text)` before each picture."""
+    sketch = Sketch(say)
+    facts = json.loads(str(evidence["catalogue"])) if "catalogue" in evidence else {}
+    base, repaired = evidence.get("base", {}), evidence.get("repaired", {})
+    fit = found["base"] or {}
+    output = (fit.get("recordings") or [{"channel": "displacement"}])[0]["channel"]
+    drive = str(evidence.get("drive", "current"))
+    sections = [
+        _named(found, facts),
+        _groups(found, facts),
+        _unknown(found),
+        section("Next experiment", *_next(found)),
+        section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"), output)),
+        _checks(found, evidence, sketch, output, drive),
+        _where(found, base, sketch, output),
+        _ranking(found, facts, sketch),
+        section("Before and after on the fitted recordings" if repaired else "Loops", sketch(base, loops.loops, base, output, drive, repaired or None)),
+        _left(base, repaired, sketch, output),
+        _shifts(found),
+        placebo_section(found.get("placebo"), found["verdict"]),
+        *_models(found, evidence, sketch, drive),
+        section("Floors", part(table=_floors(found, output))),
+    ]
+    count = len(fit.get("recordings", []))
+    about = f"Bench {fit['bench']}; {count} recordings fitted, {len(found['check'])} check recordings." if fit else "No model could be fitted."
+    return {
+        "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": TONES.get(found["verdict"], "bad"),
+        "headline": headline(found), "message": [sentence(found["message"])], "sections": [s for s in sections if s],
+    }  # fmt: skip
+
+
+def words(name: str) -> str:
+    """An effect's name as people say it."""
+    return name.replace("_", " ")
+
+
+def headline(found) -> str:
+    """The verdict in plain words."""
+    verdict = found["verdict"]
+    if verdict == "attributed":
+        names = " and ".join(f"{words(e['name'])} ({e['block']})" for e in found["effects"])
+        return f"Found what the model leaves out: {names}"
+    if verdict == "group":
+        names = "; ".join(" or ".join(words(n) for n in g) for g in found["groups"])
+        return f"Something is missing, and these recordings cannot say which: {names}"
+    if verdict == "unknown_at":
+        where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
+        return f"Something is missing that no effect of the catalogue explains; it acts most like the block {where}"
+    return {
+        "nothing_missing": "Nothing is missing: the model meets the recordings to their noise",
+        "absorbed": "What may be missing cannot show in these recordings: the density absorbs it",
+        "data_problem": "The recordings or the bench file must be mended first; no physics is judged",
+    }.get(verdict, words(verdict))
+
+
+def _named(found, facts):
+    if not found["effects"]:
+        return None
+    rows, laws = [], []
+    for e in found["effects"]:
+        size = "; ".join(f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {p['unit']}".strip() for n, p in e["parameters"].items())
+        rows.append([words(e["name"]), e["block"], size, plain(e["confidence"], 2)])
+        about = facts.get(e["name"], {})
+        if about.get("law"):
+            laws.append(f"{words(e['name'])}: {about['law']}. How it shows: {about['signature']}. Source: {about['source']}.")
+    note = "Confidence: probability of the effect among those that were fitted, times the share of the excess misfit that it takes."
+    return section("What was left out", part(table=tables.table("Effects found", ["effect", "block", "size", "confidence"], rows, note)), part(bullets=laws))
+
+
+def _groups(found, facts):
+    if not found["groups"]:
+        return None
+    rows = []
+    for number, group in enumerate(found["groups"], 1):
+        for place, name in enumerate(group, 1):
+            about = facts.get(name, {})
+            rows.append([words(name), number, place, about.get("block", ""), about.get("signature", "")])
+    text = "Each of these would repair the model about as well as the others; to name one from these recordings would be a guess."
+    head = ["rival", "group", "rank in its group", "block", "how it shows"]
+    return section("Not told apart by these recordings", part(text=text, table=tables.table("Rivals, most likely first", head, rows)))
+
+
+def _unknown(found):
+    unknown = found["unknown"]
+    if not unknown:
+        return None
+    rows = [["block it acts most like", unknown.get("block", "")], ["region", unknown.get("region", "")]]
+    rows += [["share of the excess that the nearest effect explains", f"{plain(100 * unknown['explained_share'], 2)} %"]] if "explained_share" in unknown else []
+    return section("What is known of it", part(table=tables.table("The unknown", ["question", "answer"], rows)))
+
+
+def _next(found):
+    ask = found["next_experiment"]
+    if not ask:
+        return []
+    parts = [part(text=sentence(ask["text"]))]
+    channels = [c for c in ask.get("channels", []) if c]
+    parts.append(part(text=f"Channels to record: {'; '.join(channels)}.") if channels else None)
+    rows = [[words(a), words(b), plain(p, 2)] for a, b, p in ask.get("separates", [])]
+    parts.append(part(table=tables.table("What it separates", ["effect", "from", "probability of the right name"], rows)) if rows else None)
+    return parts
+
+
+def _checks(found, evidence, sketch, output, drive):
+    if not found["check"]:
+        return None
+    drawn = sketch(evidence.get("checks"), loops.checks, evidence.get("checks"), output, drive, found["check"])
+    return section("Check recordings, before and after", part(table=tables.checks(found["check"])), drawn)
+
+
+def _where(found, base, sketch, output):
+    where = found["where"]
+    if not where or not base:
+        return None
+    blocks = {e["block"] for e in found["effects"]}
+    return section(
+        "Where simulation and recordings differ",
+        sketch(where.get("by_block"), pictures.block_map, where, blocks, output),
+        *headed("Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base)),
+        *headed("By branch, field and period", sketch(where.get("by_branch"), pictures.places, where, base, output)),
+    )
+
+
+def power(candidate, facts) -> str:
+    """Probability that these recordings would show the effect at the top of its typical range."""
+    typical = facts.get(candidate["name"], {}).get("typical")
+    visible = candidate["smallest_visible"]
+    if not typical or not visible or not math.isfinite(visible):
+        return "–"
+    z = SEEN_AT * typical / visible
+    return f"{plain(100 * 0.5 * (1 + math.erf((z - pictures.THRESHOLD) / math.sqrt(2))), 2)} %"
+
+
+def _ranking(found, facts, sketch):
+    ranked = found["candidates"]
+    if not ranked:
+        return None
+    rows = []
+    for c in ranked:
+        unit = facts.get(c["name"], {}).get("unit", "")
+        unit = "" if unit == "1" else f" {unit}"
+        fell = plain(c["achieved_chi2_drop"]) if c["achieved_chi2_drop"] is not None else "not fitted"
+        bic = plain(c["bic_change"]) if c["bic_change"] is not None else ""
+        rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), f"{plain(c['amplitude'])}{unit}",
+                     f"{plain(c['smallest_visible'])}{unit}", power(c, facts), plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
+    head = ["effect", "block", "z", "visibility", "amplitude, first order", "visible from", "power", "χ² fall, predicted", "achieved", "change of BIC"]
+    note = (
+        "z: score in standard deviations. Visibility: what share of its mark the base model cannot imitate. Visible from: amplitude seen at five "
+        "standard deviations. Power: probability that these recordings would show the effect at the top of its typical range."
+    )
+    absorbed = ", ".join(words(n) for n in found["absorbed"])
+    text = f"These recordings could not show {absorbed}: the density imitates them." if absorbed else ""
+    drawn = sketch(ranked, pictures.ranking, ranked)
+    return section("The catalogue against the misfit", drawn, part(table=tables.table("Every candidate, best first", head, rows, note)), part(text=text))
+
+
+def _left(base, repaired, sketch, output):
+    if not repaired:
+        return section("Spectrum of what is left", sketch(base, misfit.spectrum, base, output, "spectrum"))
+    return section(
+        "What the repaired model leaves",
+        *headed("By frequency and harmonic", sketch(repaired, misfit.misfit_map, repaired, "misfit-after", "Misfit of the repaired model over noise")),
+        *headed("Against field, rate and frequency", sketch(repaired, misfit.against, repaired, "against-after")),
+        *headed("Autocorrelation", sketch(repaired, misfit.autocorrelation, repaired, "autocorrelation-after")),
+        *headed("Spectrum", sketch(repaired, misfit.spectrum, repaired, output, "spectrum-after")),
+    )
+
+
+def _shifts(found):
+    after = (found["repaired"] or {}).get("parameters", {})
+    rows = []
+    for e in found["effects"]:
+        for name, (before, now) in e["shifts"].items():
+            error = after.get(name, {}).get("stderr", 0.0)
+            apart = plain(abs(now - before) / error, 2) if error else "–"
+            share = f"{plain(100 * (before - now) / abs(now), 2)} %" if now else "–"
+            rows.append([name, words(e["name"]), tables.to_error(before, error), tables.to_error(now, error), after.get(name, {}).get("unit", ""), share, apart])
+    if not rows:
+        return None
+    text = "To make up for what it lacked, the plain model had bent these constants; beside each, what it had got wrong."
+    head = ["parameter", "when adding", "before", "after", "unit", "was wrong by", "in standard errors"]
+    return section("Parameter shifts", part(text=text, table=tables.table("Constants before and after the repair", head, rows)))
+
+
+def placebo_section(placebo, verdict):
+    """How often the same search names something on recordings that lack nothing; or that it was not run, and how to."""
+    title = "Placebo: would the search cry wolf?"
+    if not placebo:
+        if verdict == "data_problem":
+            return None
+        text = (
+            "Not run. The placebo simulates the repaired model on the same drives with fresh noise, runs the same search on those recordings, and "
+            "counts how often it names something more, though nothing more is there."
+        )
+        return section(title, part(text=text + " Diagnose the same files again with --placebo N for N such searches."))
+    number = next((int(placebo[k]) for k in ("runs", "searches", "count", "n", "trials") if k in placebo), 0)
+    false = next((int(placebo[k]) for k in ("false_alarms", "named", "named_more", "alarms", "cried_wolf") if k in placebo), None)
+    parts = []
+    if number and false is not None:
+        low, high = interval(false, number)
+        parts.append(
+            part(text=f"In {number} searches on recordings simulated from the repaired model, {false} named something more, where nothing more was "
+                      f"({plain(100 * false / number, 2)} %; 95 % interval {plain(100 * low, 2)} to {plain(100 * high, 2)} %).")  # fmt: skip
+        )
+    rows = [[words(str(k)), _shown(v)] for k, v in placebo.items()]
+    return section(title, *parts, part(table=tables.table("The placebo in numbers", ["quantity", "value"], rows)))
+
+
+def _shown(value) -> str:
+    if isinstance(value, dict):
+        return "; ".join(f"{words(str(k))}: {_shown(v)}" for k, v in value.items()) or "none"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_shown(v) for v in value) or "none"
+    return plain(value, 4) if isinstance(value, float) else str(value)
+
+
+def interval(hits: int, number: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    z, p = 1.96, hits / number
+    centre, half = p + z * z / (2 * number), z * math.sqrt(p * (1 - p) / number + z * z / (4 * number**2))
+    scale = 1 + z * z / number
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
+
+
+def _models(found, evidence, sketch, drive):
+    base, repaired = found["base"], found["repaired"]
+    best = evidence.get("repaired") or evidence.get("base") or {}
+    if repaired:
+        valid = repaired["converged"] and repaired["chi2_per_sample"] < 1.3
+        yield section(
+            "The repaired model",
+            part(text=sentence(repaired["message"])),
+            *(part(table=t) for t in tables.parameters(repaired, valid, "Parameters of the repaired model")),
+            part(table=tables.correlations(repaired)),
+            sketch(best, plane.mass_map, best),
+            sketch(best.get("inside"), loops.inside, best, drive),
+            convergence_part(sketch, repaired),
+        )
+    if base:
+        valid = base["converged"] and base["chi2_per_sample"] < 1.3
+        yield section(
+            "The plain model",
+            part(text=sentence(base["message"])),
+            *(part(table=t) for t in tables.parameters(base, valid, "Parameters of the plain model")),
+            part(table=tables.recordings(base)),
+            *([] if repaired else [sketch(best, plane.mass_map, best), sketch(best.get("inside"), loops.inside, best, drive)]),
+        )
+
+
+def _floors(found, output):
+    fine, unit = scale_of(output)[2:]
+    meaning = {
+        "noise_rms": "noise between the harmonics", "solver_rms": "change of the simulation when its step is halved",
+        "density_rms": "what a smooth density may leave",
+    }  # fmt: skip
+    rows = [[meaning.get(k, words(k)), f"{plain(fine * v)} {unit}"] for k, v in found["floors"].items() if isinstance(v, (int, float))]
+    return tables.table("The floors below which nothing is claimed", ["floor", "rms"], rows) if rows else None

@@ -1,0 +1,221 @@
+"""What a report shows of a fit, as plain arrays: taken from the result once, kept beside it, drawn again at any time.
+
+Residuals are model less measurement.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from ..inversion import mass_errors
+from ..joint import data_residual
+from ..spectra import evaluate_lines
+from ..uncertainty import visited_cells
+from .residuals import autocorrelation, by_field_and_rate, by_phase, traces
+
+SHOWN = 12  # recordings whose loops are drawn
+INSIDE = 3  # recordings whose internal signals are drawn
+BINS = 200  # points a drawn loop
+STEP = 500  # simulated samples a period
+
+
+def of_fit(result, inside: bool = True, chosen=None) -> dict:
+    """The evidence of a `FitResult`; `inside`: simulate H, I_1 and M too; `chosen`: whose loops, found if None."""
+    problem = result.problem
+    misfit = model_misfit(result)
+    spectra = problem.spectra
+    chosen = chosen_recordings(result) if chosen is None else chosen
+    applied = [np.asarray(result.actuator.coil.applied_field(s.drive_at(np.arange(s.samples) * s.dt * s.frequency))) for s in spectra]
+    residuals = [evaluate_lines(m, _phases(s)) - s.residue for m, s in zip(misfit, spectra, strict=True)]
+    noise = np.array([max(s.noise_rms, 1e-300) for s in spectra])
+    scaled = [r / n for r, n in zip(residuals, noise, strict=True)]
+    found = {
+        "name": np.array([_short(r.file) for r in result.recordings]),
+        "frequency": np.array([s.frequency for s in spectra]),
+        "periods": np.array([s.periods for s in spectra]),
+        "noise": noise,
+        "chi2": np.array([r.chi2_per_sample for r in result.recordings]),
+        "rms": np.array([np.sqrt(np.mean(r**2)) for r in residuals]),
+        "chosen": np.array(chosen),
+        "loops": {str(k): _loop(spectra[k], misfit[k]) for k in chosen},
+        "zoom": {str(k): _zoom(spectra[k], misfit[k]) for k in _extremes(result)[:2]},
+        "lines": _lines(result, misfit),
+        "trace": traces(spectra, scaled),
+        "against": by_field_and_rate(spectra, applied, scaled),
+        "autocorrelation": autocorrelation(spectra, residuals),
+        "plane": _plane(result),
+    }
+    if inside:
+        found["inside"] = {str(k): _inside(result.actuator, spectra[k]) for k in sorted(_extremes(result)[:INSIDE])}
+    return found
+
+
+def model_misfit(result) -> np.ndarray:
+    """Fourier coefficients of model less measurement, (recordings, harmonics + 1), unit of the reading."""
+    problem = result.problem
+    residual = data_residual(problem, result.solution.z)
+    R, H = problem.target.lines.shape
+    misfit = residual[: R * H].reshape(R, H).astype(complex)
+    misfit[:, 1:] += 1j * residual[R * H :].reshape(R, H - 1)
+    deviations = np.asarray(problem.target.deviations)
+    return misfit * np.where(np.isfinite(deviations), deviations, 0.0)
+
+
+def chosen_recordings(result, count: int = SHOWN) -> list[int]:
+    """Which recordings are drawn: all, or the worst half of `count` and the rest spread over frequency; by frequency."""
+    frequency = np.array([s.frequency for s in result.problem.spectra])
+    order = np.argsort(frequency, kind="stable")
+    if len(order) <= count:
+        return [int(k) for k in order]
+    worst = set(np.argsort([-r.chi2_per_sample for r in result.recordings], kind="stable")[: count // 2].tolist())
+    others = [int(k) for k in order if k not in worst]
+    spread = {others[i] for i in np.linspace(0, len(others) - 1, count - len(worst)).astype(int)}
+    return [int(k) for k in order if k in worst | spread]
+
+
+def _extremes(result) -> list[int]:
+    """The worst recording, the fastest, the slowest, one between; each once."""
+    frequency = np.array([s.frequency for s in result.problem.spectra])
+    order = np.argsort(frequency, kind="stable")
+    worst = int(np.argmax([r.chi2_per_sample for r in result.recordings]))
+    return list(dict.fromkeys([worst, int(order[-1]), int(order[0]), int(order[len(order) // 2])]))
+
+
+def _phases(s) -> np.ndarray:
+    """Cycles of each sample."""
+    return np.arange(s.samples) * s.dt * s.frequency
+
+
+def _short(file: str) -> str:
+    return Path(str(file)).name
+
+
+def _loop(s, misfit) -> dict:
+    """One period at bin centres: drive, measured (mean of the periods), model, and the noise of that mean."""
+    phases, residue, count = by_phase(s, s.residue, BINS)
+    lines = evaluate_lines(s.reading, phases)
+    return {
+        "phase": phases, "drive": s.drive_at(phases), "measured": lines + residue, "model": lines + evaluate_lines(misfit, phases),
+        "noise": s.noise_rms / np.sqrt(np.maximum(count, 1)),
+    }  # fmt: skip
+
+
+def _zoom(s, misfit, width: float = 0.08) -> dict:
+    """Raw samples about the largest misfit of the last period, s from the record's start."""
+    phases = np.arange(1000) / 1000
+    smooth = evaluate_lines(misfit, phases)
+    centre = s.periods - 1 + phases[int(np.argmax(np.abs(smooth)))]
+    all_phases = _phases(s)
+    near = np.flatnonzero(np.abs(all_phases - centre) < width)
+    near = near[:: max(1, len(near) // 250)]
+    reading = evaluate_lines(s.reading, all_phases[near])
+    return {"time": near * s.dt, "measured": reading + s.residue[near], "model": reading + evaluate_lines(misfit, all_phases[near])}
+
+
+def _lines(result, misfit) -> dict:
+    """Amplitudes of the harmonics: measured, misfit, rms of their noise; and what lies between for the chosen few."""
+    problem = result.problem
+    deviations = np.asarray(problem.target.deviations)
+    amplitude = np.full(deviations.shape[1], 2.0)
+    amplitude[0] = 1.0
+    parts = np.where(np.arange(deviations.shape[1]) == 0, 1.0, np.sqrt(2.0))
+    between = {}
+    for k in _extremes(result)[:3]:
+        s = problem.spectra[k]
+        order = s.between_f / s.frequency
+        keep = order < deviations.shape[1]
+        edges = np.linspace(0, deviations.shape[1], 161)
+        place = np.clip(np.digitize(order[keep], edges) - 1, 0, 159)
+        number = np.bincount(place, minlength=160)
+        power = np.bincount(place, s.between_power[keep], minlength=160)[number > 0] / number[number > 0]
+        between[str(k)] = {"order": (0.5 * (edges[1:] + edges[:-1]))[number > 0], "amplitude": 2 * np.sqrt(power / s.samples)}
+    return {
+        "measured": amplitude * np.abs(np.asarray(problem.target.lines)),
+        "misfit": amplitude * np.abs(misfit),
+        "floor": np.where(np.isfinite(deviations), amplitude * parts * deviations, np.nan),
+        "between": between,
+    }
+
+
+def _plane(result) -> dict:
+    """Masses of the plane without its once-switching edge, their standard errors, which cells a recording switches."""
+    hysteresis = result.actuator.hysteresis
+    inner = slice(1, -1)
+    try:
+        errors = mass_errors(result)[inner, inner]
+    except np.linalg.LinAlgError:  # a stalled fit may have no covariance
+        errors = np.full((hysteresis.cells - 2,) * 2, np.nan)
+    return {
+        "masses": np.asarray(hysteresis.masses)[inner, inner], "errors": errors,
+        "seen": visited_cells(result.actuator, result.problem.spectra)[inner, inner], "levels": np.asarray(hysteresis.levels)[inner],
+    }  # fmt: skip
+
+
+def steady(actuator, s):
+    """`Signals` of one settled period on the recording's drive; the same compiled program for all plain drives."""
+    from magjax.preisach.memory import nesting
+    from magjax.simulate import simulate
+
+    power = np.abs(s.drive[1:]) ** 2
+    highest = int(np.flatnonzero(power > 1e-3 * power.max()).max()) + 1
+    count = STEP * int(min(8, 2 ** np.ceil(np.log2(max(highest / 1.5, 1)))))
+    drive = s.drive_at(np.arange(count) / count)
+    history = actuator.hysteresis.history.shape[0] // 2
+    corners = max(8, int(4 * np.ceil((nesting(np.tile(drive, 2)) + history) / 4)))
+    return simulate(actuator, drive, 1 / (s.frequency * count), periodic=True, corners=corners)
+
+
+def _inside(actuator, s) -> dict:
+    """H, I_1 = (H - H_bias)/c0 and M over one period, thinned."""
+    signals = steady(actuator, s)
+    thin = slice(None, None, max(1, len(signals.field) // BINS))
+    H = np.asarray(signals.field)[thin]
+    found = {
+        "phase": np.arange(len(H)) / len(H), "H": H, "M": np.asarray(signals.magnetization)[thin],
+        "applied": np.asarray(actuator.coil.applied_field(signals.current))[thin],
+    }  # fmt: skip
+    if actuator.coil.drive == "current":
+        found["current"] = np.asarray(signals.current)[thin]
+        found["I_1"] = (H - float(actuator.coil.H_bias)) / float(actuator.coil.c0)
+    return found
+
+
+def of_checks(before, after, recordings, bench) -> dict:
+    """Measured and predicted periods of check recordings, before and after a repair."""
+    from ..spectra import reduce_recording
+
+    found = {}
+    for k, recording in enumerate(recordings):
+        if recording.frequency() is None:
+            continue
+        s = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
+        phases, residue, count = by_phase(s, s.residue, BINS)
+        measured = evaluate_lines(s.reading, phases) + residue
+        entry = {
+            "name": np.array(_short(recording.origin.get("file", recording.name))), "frequency": np.array(s.frequency), "phase": phases,
+            "drive": s.drive_at(phases), "measured": measured, "noise": s.noise_rms / np.sqrt(np.maximum(count, 1)),
+        }  # fmt: skip
+        for key, actuator in (("before", before), ("after", after)):
+            reading = np.asarray(steady(actuator, s).reading)
+            predicted = np.interp(phases, np.arange(len(reading) + 1) / len(reading), np.append(reading, reading[0]))
+            entry[key] = predicted - (predicted.mean() - measured.mean()) * (bench.output == "flux_density")
+        found[str(k)] = entry
+    return found
+
+
+def of_recordings(recordings, bench) -> dict:
+    """The readings as recorded, one row a period, for recordings that no model may judge yet."""
+    found = {}
+    for k, recording in enumerate(recordings[:SHOWN]):
+        values = np.asarray(recording.channels[bench.output], float)
+        blocks = recording.repeats(bench.output)
+        drive = recording.repeats(bench.drive)
+        if not len(blocks):
+            blocks, drive = values[None], np.asarray(recording.channels[bench.drive], float)[None]
+        pick = [0, *range(max(1, len(blocks) - 2), len(blocks))]  # the first and the last two
+        thin = slice(None, None, max(1, blocks.shape[1] // BINS))
+        found[str(k)] = {
+            "name": np.array(_short(recording.name)), "frequency": np.array(recording.frequency() or 0.0), "drive": drive[pick][:, thin],
+            "reading": blocks[pick][:, thin], "number": np.array(pick) + 1,
+        }  # fmt: skip
+    return found

@@ -1,0 +1,95 @@
+"""The page of a fit: may it be trusted, what came out, how it meets each recording, what it leaves, what it holds inside."""
+
+from . import loops, misfit, plane, tables
+from .page import Sketch, part, section
+from .style import plain
+
+AT_NOISE, FAR = 1.1, 2.0  # chi2/N: below it the error bars hold; above it they mean nothing
+WORST_AT_NOISE = 1.6
+
+
+def validity(fit) -> tuple[str, str, str, bool]:
+    """(tone, headline, advice, whether the error bars hold) of a fit."""
+    chi2 = fit["chi2_per_sample"]
+    bound = [n for n, p in fit["parameters"].items() if p["at_bound"]]
+    loose = [n for n, p in fit["parameters"].items() if p["free"] and not p["identified"]]
+    worst = max((r["chi2_per_sample"] for r in fit["recordings"]), default=chi2)
+    ask = "Run the diagnosis on the same files; it says what physics is missing, and where:"
+    if not fit["converged"]:
+        return "bad", "Not converged: these numbers are not a result", "Raise --max-jacobians, or start nearer with --model.", False
+    if chi2 > FAR or chi2 != chi2:
+        return "bad", f"Error bars not valid: the residual is {plain(chi2**0.5, 2)} times the noise", ask, False
+    if bound:
+        return "bad", f"At a bound: {', '.join(bound)}", "A parameter at its bound takes the blame for something else; free another, or check the bench file.", False
+    if chi2 > AT_NOISE or worst > WORST_AT_NOISE:
+        where = "" if chi2 > AT_NOISE else " in one recording"
+        return "warn", f"A little above the noise{where} (χ²/N = {plain(chi2)}): error bars are too narrow", ask, False
+    if loose:
+        return "warn", f"At the noise, but not identified: {', '.join(loose)}", "These recordings do not determine it; record another range, or hold it fixed.", True
+    return "good", f"At the noise (χ²/N = {plain(chi2)}): the error bars hold", "", True
+
+
+def fit_page(fit, evidence, say=lambda text: None) -> dict:
+    """The page's words, tables and pictures; `say(text)` before each picture."""
+    tone, headline, advice, valid = validity(fit)
+    output, drive = _quantities(fit, evidence)
+    sketch = Sketch(say)
+    number = len(fit["recordings"])
+    span = sorted(r["frequency"] for r in fit["recordings"])
+    sections = [
+        section("Parameters", *(part(table=t) for t in tables.parameters(fit, valid)), part(table=tables.correlations(fit))),
+        section("Recordings", part(table=tables.recordings(fit))),
+        section(
+            "Measured and fitted",
+            part(heading="Check recordings", table=tables.checks(fit["check"], repaired=False)) if fit.get("check") else None,
+            *headed("Loops", sketch(evidence, loops.loops, evidence, output, drive)),
+            *headed("Zoom in time", sketch(evidence, loops.zoom, evidence, output)),
+        ),
+        residual_section(sketch, evidence, output),
+        section("The Preisach plane", sketch(evidence, plane.mass_map, evidence)),
+        section("Inside the model", sketch(evidence.get("inside"), loops.inside, evidence, drive)),
+        section("How the fit went", convergence_part(sketch, fit), part(table=tables.numbers(fit))),
+    ]
+    command = fit.get("reproduce", "").replace("magjax fit", "magjax diagnose", 1) if "diagnosis" in advice else ""
+    facts = f"Bench {fit['bench']}; {number} recording{'s' if number != 1 else ''}, {plain(span[0], 4)} to {plain(span[-1], 4)} Hz."
+    return {
+        "title": f"Joint fit of {fit['bench']}", "facts": facts, "tone": tone, "headline": headline, "message": [sentence(fit["message"])],
+        "advice": advice, "command": command, "sections": [s for s in sections if s],
+    }  # fmt: skip
+
+
+def residual_section(sketch, evidence, output, title: str = "What the fit leaves"):
+    """Map, traces, branches, autocorrelation and spectrum of the residual."""
+    return section(
+        title,
+        *headed("By frequency and harmonic", sketch(evidence, misfit.misfit_map, evidence)),
+        *headed("Along time", sketch(evidence, misfit.traces, evidence)),
+        *headed("Against field, rate and frequency", sketch(evidence, misfit.against, evidence)),
+        *headed("Autocorrelation", sketch(evidence, misfit.autocorrelation, evidence)),
+        *headed("Spectrum", sketch(evidence, misfit.spectrum, evidence, output)),
+    )
+
+
+def headed(heading, drawn) -> list:
+    """A part under its heading, nothing where there is no part."""
+    return [{"heading": heading, **drawn}] if drawn else []
+
+
+def convergence_part(sketch, fit):
+    """How the objective fell, where the fit kept it."""
+    steps = [s for s in fit.get("history", []) if s[2] is not None and s[2] > 0]
+    return sketch(steps, misfit.convergence, steps)
+
+
+def sentence(text: str) -> str:
+    """A message with a capital and a full stop."""
+    text = text.strip()
+    return (text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".")) if text else ""
+
+
+def _quantities(fit, evidence):
+    """(output, drive) of the recordings."""
+    unit = fit["recordings"][0]["unit"] if fit["recordings"] else "m"
+    drive = "current" if "current" in str(evidence.get("drive", "current")) else "field"
+    channel = fit["recordings"][0]["channel"] if fit["recordings"] else "displacement"
+    return channel if channel in tables.CHANNEL_OF.values() else tables.CHANNEL_OF.get(unit, "displacement"), drive

@@ -1,0 +1,215 @@
+"""Figures over one period: loops with their residual strips, a zoom in time, the signals inside, check recordings."""
+
+import numpy as np
+
+from .style import BLUE, INK, MEASURED, MODEL, MUTED, PALE, SKY, VERMILION, canvas, drive_label, picture, plain, scale_of, styled
+
+COLUMNS = 3
+WIDTH = 10.0  # inches
+SHOWN = 12  # check recordings
+
+
+def loops(evidence, output: str, drive: str, after=None, stem: str = "loops"):
+    """Measured and simulated loops with a residual strip each; `after`: the same of a repaired model."""
+    names, frequency = evidence["name"], evidence["frequency"]
+    panels = []
+    for k in evidence["chosen"]:
+        loop = dict(evidence["loops"][str(k)])
+        title = f"{names[k]}\n{plain(frequency[k])} Hz, χ²/N {plain(evidence['chi2'][k])}"
+        strips = [("model", "fitted", loop["model"] - loop["measured"])]
+        if after is not None and str(k) in after["loops"]:
+            second = after["loops"][str(k)]
+            loop["after"] = second["model"] + loop["measured"] - second["measured"]
+            strips = [("model", "before", strips[0][2]), ("after", "after", second["model"] - second["measured"])]
+            title = f"{names[k]}\n{plain(frequency[k])} Hz, χ²/N {plain(evidence['chi2'][k])} → {plain(after['chi2'][k])}"
+        panels.append((title, loop, strips))
+    what = "fitted" if after is None else "simulated before and after the repair"
+    title = f"Measured and {what} loops"
+    total = len(names)
+    some = "" if len(panels) == total else f" {len(panels)} of {total} recordings are shown: the worst, and others over the frequencies."
+    worst = int(np.argmax(evidence["chi2"]))
+    detail = f"The worst recording is {names[worst]} with χ²/N {plain(evidence['chi2'][worst])}."
+    caption = (
+        "Above: the reading (mean of the periods) and the model against the drive. Below: model less measurement over one period, with "
+        f"twice the noise of the mean as the band.{some}"
+    )
+    return _panels(panels, output, drive, stem, title, caption, detail)
+
+
+def checks(entries, output: str, drive: str, rows, stem: str = "checks"):
+    """Check recordings: measured, predicted before and after."""
+    panels = []
+    for key, entry in list(entries.items())[:SHOWN]:
+        row = rows[int(key)]
+        loop = {**entry, "model": entry["before"]}
+        strips = [("model", "before", entry["before"] - entry["measured"]), ("after", "after", entry["after"] - entry["measured"])]
+        factor, unit = scale_of(output)[2:]
+        size = " → ".join(plain(factor * row[k]) for k in ("rms_before", "rms_after"))
+        panels.append((f"{entry['name']}\nrms {size} {unit}, noise {plain(factor * row['noise_rms'])}", loop, strips))
+    caption = (
+        "Recordings that took no part in any fit: the reading and its prediction before and after the repair, and below them prediction "
+        "less measurement with twice the noise of the mean as the band."
+    )
+    return _panels(panels, output, drive, stem, "Check recordings before and after", caption, "")
+
+
+def _panels(panels, output, drive, stem, title, caption, detail):
+    factor, label, fine, unit = scale_of(output)
+    drive_factor, drive_name = drive_label(drive)
+    columns = min(COLUMNS, max(len(panels), 1))
+    rows = int(np.ceil(len(panels) / columns))
+    height = 4.0
+    with styled():
+        figure = canvas(WIDTH * columns / COLUMNS + (0.5 if columns < COLUMNS else 0), rows * height)
+        for k, (heading, loop, strips) in enumerate(panels):
+            row, column = divmod(k, columns)
+            left, wide = (column + 0.19) / columns, 0.76 / columns
+            top = 1 - row / rows
+            upper = figure.add_axes([left, top - 0.60 / rows, wide, 0.49 / rows])
+            lower = figure.add_axes([left, top - 0.90 / rows, wide, 0.17 / rows])
+            _loop(upper, loop, drive_factor, factor, heading)
+            _strip(lower, loop, strips, fine)
+            upper.set_xlabel(drive_name)
+            lower.set_xlabel("part of the period")
+            if column == 0:
+                upper.set_ylabel(label)
+                lower.set_ylabel(f"residual / {unit}")
+            if k == 0:
+                upper.legend(loc="upper left")
+        return picture(figure, stem, title, caption, detail)
+
+
+def _loop(axes, loop, drive_factor, factor, heading):
+    drive = drive_factor * loop["drive"]
+    close = lambda x: np.append(x, x[0])
+    axes.plot(close(drive), factor * close(loop["measured"]), color=SKY, lw=3.2, alpha=0.75, solid_capstyle="round", label="measured")
+    axes.plot(close(drive), factor * close(loop["model"]), color=MODEL, lw=1.0, ls=(0, (4, 1.6)), label="before" if "after" in loop else "fitted")
+    if "after" in loop:
+        axes.plot(close(drive), factor * close(loop["after"]), color=INK, lw=0.8, label="after")
+    axes.set_title(heading, loc="left", linespacing=1.3)
+    axes.margins(0.04)
+
+
+def _strip(axes, loop, strips, fine):
+    phase, band = loop["phase"], 2 * fine * loop["noise"]
+    axes.fill_between(phase, -band, band, color=PALE, lw=0)
+    axes.axhline(0, color=MUTED, lw=0.5)
+    styles = {"model": {"color": MODEL, "lw": 0.9}, "after": {"color": INK, "lw": 0.9}}
+    for key, _, values in strips:
+        axes.plot(phase, fine * values, **styles[key])
+    reach = max(np.max(np.abs(fine * values)) for _, _, values in strips)
+    reach = max(1.1 * reach, 1.6 * float(np.max(band)))
+    axes.set(xlim=(0, 1), ylim=(-reach, reach))
+    axes.locator_params(axis="y", nbins=3)
+
+
+def zoom(evidence, output: str, stem: str = "zoom"):
+    """Raw samples and the model about the largest misfit of two recordings."""
+    factor, label = scale_of(output)[:2]
+    keys = list(evidence["zoom"])
+    with styled():
+        figure = canvas(WIDTH, 2.9)
+        for i, key in enumerate(keys):
+            axes = figure.add_axes([0.07 + i / 2, 0.17, 0.41 if len(keys) > 1 else 0.9, 0.68])
+            part = evidence["zoom"][key]
+            axes.plot(1e3 * part["time"], factor * part["measured"], ls="", marker=".", ms=3.4, mew=0, color=MEASURED, label="samples")
+            axes.plot(1e3 * part["time"], factor * part["model"], color=MODEL, lw=1.2, label="fitted")
+            k = int(key)
+            axes.set_title(f"{evidence['name'][k]}, {plain(evidence['frequency'][k])} Hz", loc="left")
+            axes.set_xlabel("time / ms")
+            if i == 0:
+                axes.set_ylabel(label)
+                axes.legend()
+            _pad(axes)
+        caption = "Samples as recorded and the model, about the moment of the largest misfit: the worst recording" + (
+            " and the fastest." if len(keys) > 1 else "."
+        )
+        return picture(figure, stem, "Time zoom at the largest misfit", caption)
+
+
+def _pad(axes):
+    axes.margins(0.03, 0.08)
+    axes.locator_params(axis="y", nbins=5)
+
+
+def inside(evidence, drive: str, stem: str = "inside"):
+    """H, I_1 and M over a period, and M against H, of a few recordings."""
+    keys = list(evidence["inside"])
+    with_current = "I_1" in evidence["inside"][keys[0]]
+    rows = ["H", "I_1", "M", "loop"] if with_current else ["H", "M", "loop"]
+    heights = {"H": 1.25, "I_1": 1.25, "M": 1.25, "loop": 2.2}
+    gap, top, bottom = 0.42, 0.32, 0.3
+    total = sum(heights[r] for r in rows) + gap * (len(rows) - 1) + top + bottom + 0.1
+    with styled():
+        figure = canvas(WIDTH, total)
+        for c, key in enumerate(keys):
+            signals, y = evidence["inside"][key], total - top
+            for row in rows:
+                y -= heights[row]
+                axes = figure.add_axes([(c + 0.2) / 3, y / total, 0.76 / 3, heights[row] / total])
+                _inside_row(axes, row, signals, drive, c == 0)
+                if row == "H":
+                    axes.set_title(f"{evidence['name'][int(key)]}, {plain(evidence['frequency'][int(key)])} Hz", loc="left")
+                y -= gap
+        words = "the current I that is applied and I₁ = (H − H_bias)/c₀, which is left of it for the field; " if with_current else ""
+        caption = (
+            f"Signals that no instrument reads, as the fitted model has them: the field that is applied and the field H in the rod; {words}"
+            "the magnetization M; and M against H."
+        )
+        return picture(figure, stem, "Signals inside the model: H, I₁ and M" if with_current else "Signals inside the model: H and M", caption)
+
+
+def _inside_row(axes, row, signals, drive, first):
+    phase = signals["phase"]
+    scale, unit = (1e-3, "kA/m") if np.abs(signals["H"]).max() > 2e3 else (1.0, "A/m")
+    magnet, magnet_unit = (1e-3, "kA/m") if np.abs(signals["M"]).max() > 2e3 else (1.0, "A/m")
+    if row == "H":
+        axes.plot(phase, scale * signals["applied"], color=SKY, lw=2.6, alpha=0.8, label="applied")
+        axes.plot(phase, scale * signals["H"], color=INK, lw=0.9, label="H")
+        label = f"field / ({unit})"
+    elif row == "I_1":
+        axes.plot(phase, signals["current"], color=SKY, lw=2.6, alpha=0.8, label="I")
+        axes.plot(phase, signals["I_1"], color=INK, lw=0.9, label="I₁")
+        label = "current / A"
+    elif row == "M":
+        axes.plot(phase, magnet * signals["M"], color=BLUE, lw=1.2)
+        label = f"M / ({magnet_unit})"
+    else:
+        close = lambda x: np.append(x, x[0])
+        axes.plot(scale * close(signals["H"]), magnet * close(signals["M"]), color=BLUE, lw=1.2)
+        label = f"M / ({magnet_unit})"
+        axes.set_xlabel(f"H / ({unit})")
+    if row in ("H", "I_1") and first:
+        axes.legend(loc="upper right", ncols=2, handlelength=1.2, borderaxespad=0)
+    if first:
+        axes.set_ylabel(label)
+    if row == "M":
+        axes.set_xlabel("part of the period")
+    if row != "loop":
+        axes.set_xlim(0, 1)
+    axes.locator_params(axis="y", nbins=4)
+
+
+def periods(entries, output: str, stem: str = "periods"):
+    """The readings as recorded: the first and the last periods over each other."""
+    factor, label = scale_of(output)[:2]
+    columns = min(COLUMNS, len(entries))
+    rows = int(np.ceil(len(entries) / columns))
+    colours = [VERMILION, BLUE, INK]
+    with styled():
+        figure = canvas(WIDTH * max(columns, 2) / COLUMNS, 2.6 * rows)
+        for k, entry in enumerate(entries.values()):
+            row, column = divmod(k, columns)
+            axes = figure.add_axes([(column + 0.19) / columns, 1 - (row + 0.80) / rows, 0.76 / columns, 0.62 / rows])
+            for i, (number, reading) in enumerate(zip(entry["number"], entry["reading"], strict=True)):
+                phase = np.arange(len(reading)) / len(reading)
+                axes.plot(phase, factor * reading, color=colours[i], lw=[2.4, 1.4, 0.8][i], ls=["-", (0, (4, 2)), "-"][i], label=f"period {number}")
+            axes.set_title(f"{entry['name']}" + (f", {plain(float(entry['frequency']))} Hz" if entry["frequency"] else ""), loc="left")
+            axes.set_xlim(0, 1)
+            axes.set_xlabel("part of the period")
+            if column == 0:
+                axes.set_ylabel(label)
+            if k == 0:
+                axes.legend(loc="best")
+        caption = "The readings as recorded, the first and the last two periods over each other; settled and sound recordings repeat."
+        return picture(figure, stem, "The recordings as they are", caption)

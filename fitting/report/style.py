@@ -1,0 +1,102 @@
+"""How figures look and how they become inline SVG: text stays text, numbers are short, nothing points outside.
+
+Colours are those of Okabe and Ito, which colour-blind readers tell apart; lines differ by dash or marker too.
+"""
+
+import dataclasses
+import io
+import re
+
+from matplotlib import rc_context
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+INK, MUTED, PALE = "#1a1a1a", "#555555", "#c8c8c8"
+BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#007F5C", "#E69F00", "#56B4E9", "#A3527F"
+MEASURED, MODEL, AFTER = BLUE, VERMILION, GREEN
+SEQUENTIAL = "cividis"
+FONT = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', Arial, sans-serif"
+RC = {
+    "font.family": "DejaVu Sans", "font.size": 8.5, "axes.titlesize": 8.5, "axes.labelsize": 8.5, "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5, "legend.fontsize": 7.5, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK, "text.color": INK, "xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
+    "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "lines.linewidth": 1.2, "legend.frameon": False,
+    "axes.axisbelow": True, "svg.fonttype": "none", "svg.hashsalt": "magjax", "hatch.linewidth": 0.5, "figure.dpi": 72, "path.simplify": True,
+    "axes.formatter.useoffset": False, "axes.formatter.limits": (-3, 4), "axes.formatter.use_mathtext": False, "mathtext.fontset": "dejavusans",
+}  # fmt: skip
+
+
+def styled():
+    """The context in which every figure is drawn."""
+    return rc_context(RC)
+
+
+def canvas(width: float, height: float) -> Figure:
+    """An empty figure, inches."""
+    figure = Figure(figsize=(width, height))
+    FigureCanvasSVG(figure)
+    return figure
+
+
+def scale_of(output: str) -> tuple[float, str, float, str]:
+    """(factor, label) of a reading and (factor, unit) of its residual."""
+    return {
+        "displacement": (1e6, "displacement / µm", 1e9, "nm"),
+        "flux_density": (1.0, "flux density / T", 1e3, "mT"),
+        "magnetization": (1e-3, "magnetization / (kA/m)", 1.0, "A/m"),
+    }[output]
+
+
+def drive_label(drive: str) -> tuple[float, str]:
+    """(factor, label) of the drive."""
+    return (1.0, "current / A") if drive == "current" else (1.0, "applied field / (A/m)")
+
+
+def plain(value: float, digits: int = 3) -> str:
+    """A number as people write it: no exponent between 1e-3 and 1e5."""
+    if value is None or value != value:
+        return "–"
+    if value == 0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        text = f"{value:.{digits}g}"
+        return f"{float(text):.0f}" if "e" in text else text.replace("-", "−")
+    mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
+    return f"{mantissa}e{int(exponent)}".replace("-", "−")
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """One figure of a page: `title` is its name for a screen reader, `caption` stands below it, `svg` is inline."""
+
+    stem: str
+    title: str
+    caption: str
+    svg: str
+
+
+def picture(figure: Figure, stem: str, title: str, caption: str, description: str = "") -> Picture:
+    """A drawn figure with its words; `description`: what the caption does not say, for those who do not see it."""
+    return Picture(stem, title, caption, to_svg(figure, stem, title, f"{caption} {description}".strip()))
+
+
+def to_svg(figure: Figure, stem: str, title: str, description: str) -> str:
+    """The figure as inline SVG with role, name and description; ids begin with `stem`."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].rstrip()
+    svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.S)
+    svg = re.sub(r"<!--.*?-->\s*", "", svg, flags=re.S)
+    svg = re.sub(r' (?:d|x|y|points)="[^"]*"', lambda m: re.sub(r"(\d\.\d\d)\d+", r"\1", m[0]), svg)
+    svg = re.sub(r'\bid="', f'id="{stem}-', svg)
+    svg = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{stem}-", svg)
+    svg = svg.replace("'DejaVu Sans'", FONT).replace(", 'Bitstream Vera Sans', 'Computer Modern Sans Serif', 'Lucida Grande'", "")
+    svg = re.sub(r"\n\s*", "\n", svg)
+    head, body = svg.split(">", 1)
+    head += f' role="img" aria-label="{_escape(title)}" aria-describedby="{stem}-desc"'
+    return f'{head}>\n<title>{_escape(title)}</title>\n<desc id="{stem}-desc">{_escape(description)}</desc>{body}'
+
+
+def _escape(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")

@@ -1,0 +1,97 @@
+"""The tables of the reports: numbers to the digits that their errors allow, flags in words."""
+
+import math
+from pathlib import Path
+
+from .style import plain, scale_of
+
+CHANNEL_OF = {"m": "displacement", "T": "flux_density", "A/m": "magnetization"}
+
+
+def table(caption, head, rows, note: str = "") -> dict:
+    """A table for the template: the first cell of each row is its header."""
+    return {"caption": caption, "head": list(head), "rows": [[str(c) for c in row] for row in rows], "note": note}
+
+
+def to_error(value: float, error: float) -> str:
+    """A value to the second digit of its error."""
+    if not (error > 0 and math.isfinite(error)) or value == 0:
+        return plain(value, 6)
+    digits = max(1, int(math.floor(math.log10(abs(value)))) - int(math.floor(math.log10(error))) + 2) if abs(value) > error else 2
+    return plain(value, min(digits, 10))
+
+
+def flags(p) -> str:
+    """What a reader must know of one estimate."""
+    said = [("at bound", p["at_bound"]), ("not identified", not p["identified"])]
+    return ", ".join(text for text, on in said if on) or ("ok" if p["free"] else "")
+
+
+def parameters(fit, valid: bool, caption: str = "Fitted parameters") -> list[dict]:
+    """Two tables: fitted parameters with errors and flags, and those held fixed."""
+    free, fixed = [], []
+    for name, p in fit["parameters"].items():
+        if not p["free"]:
+            fixed.append([name, p.get("meaning", ""), plain(p["value"], 6), p["unit"]])
+            continue
+        spread = 1.96 * p["stderr"]
+        interval = f"{to_error(p['value'] - spread, p['stderr'])} to {to_error(p['value'] + spread, p['stderr'])}"
+        row = [name, p.get("meaning", ""), plain(p.get("start"), 5), to_error(p["value"], p["stderr"]), plain(p["stderr"], 2), interval, p["unit"], flags(p)]
+        free.append(row)
+    error, interval = ("std. error", "95 % interval") if valid else ("std. error (not valid)", "95 % interval (not valid)")
+    note = "" if valid else "Standard errors assume that only noise is left. It is not, so the true errors are larger by an unknown amount."
+    tables = []
+    if free:
+        tables.append(table(caption, ["parameter", "meaning", "start", "value", error, interval, "unit", "flags"], free, note))
+    if fixed:
+        tables.append(table("Held at the bench file's values", ["parameter", "meaning", "value", "unit"], fixed))
+    return tables
+
+
+def correlations(fit) -> dict | None:
+    """The correlation matrix of the fitted constants, those beyond 0.9 marked; None with less than two constants."""
+    pairs = fit["correlations"]
+    names = list(dict.fromkeys(n for pair in pairs for n in pair.split("~")))
+    if len(names) < 2:
+        return None
+    rows = []
+    for a in names:
+        row = [a]
+        for b in names:
+            value = 1.0 if a == b else pairs.get(f"{a}~{b}", pairs.get(f"{b}~{a}"))
+            strong = a != b and value is not None and abs(value) > 0.9
+            row.append("" if value is None else f"{value:.2f}".replace("-", "−") + (" strong" if strong else ""))
+        rows.append(row)
+    note = "“strong” marks pairs beyond 0.9: their values move together, and neither is known as well alone." if any("strong" in c for r in rows for c in r) else ""
+    return table("Correlations of the fitted constants", ["", *names], rows, note)
+
+
+def recordings(fit) -> dict:
+    """Every recording with its noise and its misfit."""
+    rows = []
+    for r in fit["recordings"]:
+        fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
+        rows.append([Path(r["file"]).name, plain(r["frequency"], 4), r["periods"], f"{plain(fine * r['noise_rms'])} {unit}",
+                     f"{plain(fine * r['residual_rms'])} {unit}", plain(r["chi2_per_sample"]), r["sha256"][:12]])  # fmt: skip
+    return table("Recordings", ["recording", "frequency / Hz", "periods", "noise rms", "residual rms", "χ²/N", "sha256 begins"], rows)
+
+
+def checks(rows, repaired: bool = True) -> dict:
+    """Prediction errors on recordings that took no part."""
+    body = []
+    for r in rows:
+        fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
+        shown = [plain(fine * r["rms_before"]), plain(fine * r["rms_after"])] if repaired else [plain(fine * r["rms_after"])]
+        body.append([Path(r["file"]).name, *shown, plain(fine * r["noise_rms"]), unit])
+    head = ["recording", "rms error before", "rms error after", "noise rms", "unit"] if repaired else ["recording", "rms error", "noise rms", "unit"]
+    return table("Check recordings", head, body)
+
+
+def numbers(fit) -> dict:
+    """Size and cost of the fit."""
+    rows = [["χ²/N", plain(fit["chi2_per_sample"], 4)], ["numbers met (real and imaginary parts of harmonics)", fit.get("data_count", "")]]
+    if fit.get("effective_unknowns") is not None:
+        rows.append(["effective unknowns", plain(fit["effective_unknowns"], 3)])
+    rows += [["level L of the plane, edges included", fit["levels"]], ["BIC", plain(fit["bic"], 6)], ["Jacobians", fit["jacobians"]]]
+    rows += [["compilation / s", plain(fit["compile_s"], 2)], ["iteration / s", plain(fit["solve_s"], 2)]]
+    return table("Size and cost of the fit", ["quantity", "value"], rows)

@@ -1,0 +1,79 @@
+"""Write a result folder: the JSON that others read, the model, the evidence of the report, and the report itself."""
+
+import json
+import platform
+from importlib import metadata
+from pathlib import Path
+
+from ..result import write_atomically, write_model
+from . import store
+from .page import rebuild
+
+
+def write_fit(folder: Path, result, recordings, content: dict, reproduce: str, progress=None) -> None:
+    """Write fit.json, model.json, report.npz, figures and report.html of a fit. `progress(text)` at every step."""
+    from . import evidence
+
+    folder = Path(folder)
+    content = {**content, "reproduce": reproduce, "versions": versions()}
+    write_atomically(folder / "fit.json", json.dumps(content, indent=1))
+    write_model(folder, result.actuator, result.bench)
+    _say(progress, "report: signals")
+    store.save(folder, {**evidence.of_fit(result), "drive": result.bench.drive})
+    rebuild(folder, progress)
+
+
+def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduce: str, checks=(), progress=None) -> None:
+    """Write diagnosis.json, the repaired model, report.npz, figures and report.html of a diagnosis.
+
+    `checks`: the check recordings, drawn before and after; `progress(text)` at every step.
+    """
+    from . import evidence
+
+    folder = Path(folder)
+    content = {**content, "reproduce": reproduce, "versions": versions()}
+    write_atomically(folder / "diagnosis.json", json.dumps(content, indent=1))
+    base, repaired = diagnosis.base, diagnosis.repaired
+    best = repaired or base
+    found = {}
+    if best is not None:
+        write_model(folder, best.actuator, best.bench)
+        found["drive"] = best.bench.drive
+    _say(progress, "report: signals")
+    if diagnosis.verdict == "data_problem":
+        found["recordings"] = evidence.of_recordings(recordings, best.bench) if best is not None else {}
+    elif base is not None:
+        found["base"] = evidence.of_fit(base, inside=repaired is None)
+        found["catalogue"] = json.dumps(catalogue())
+        if repaired is not None:
+            found["repaired"] = evidence.of_fit(repaired, chosen=[int(k) for k in found["base"]["chosen"]])
+        if checks:
+            found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench)
+    store.save(folder, found)
+    rebuild(folder, progress)
+
+
+def catalogue() -> dict:
+    """What the page tells of each effect: block, law, signature, source, unit and the top of its typical range."""
+    from magjax.effects import CATALOGUE
+
+    rows = {}
+    for effect in CATALOGUE:
+        info = effect.parameters()[effect.amplitude]
+        typical = max((abs(t) for t in info.typical), default=None) if info.typical else None
+        rows[effect.name] = {
+            "block": effect.block, "law": effect.law.rstrip("."), "signature": effect.signature.rstrip("."), "source": effect.source.rstrip("."),
+            "unit": info.unit, "typical": typical,
+        }  # fmt: skip
+    return rows
+
+
+def versions() -> str:
+    """magjax and what its numbers rest on."""
+    names = [f"{name} {metadata.version(name)}" for name in ("magjax", "jax", "numpy")]
+    return ", ".join([*names, f"Python {platform.python_version()}"])
+
+
+def _say(progress, text):
+    if progress is not None:
+        progress(text)
