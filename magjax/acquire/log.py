@@ -220,8 +220,10 @@ class Log:
         return sum(len(p[4]) for p in self.pieces)
 
     def started(self, segment: int) -> dict:
-        """The start event of a segment: rate_Hz, settle_samples, frequency_Hz and what else was known."""
-        return next((e for e in self.events if e["event"] == "start" and e["segment"] == segment), {})
+        """The start event of a segment: rate_Hz, settle_samples, frequency_Hz and what else was known; where it is
+        damaged, the counts at its end, which repeat the most of it."""
+        found = [e for kind in ("start", "counts") for e in self.events if e["event"] == kind and e.get("segment") == segment]
+        return found[0] if found else {}
 
     def segment(self, number: int):
         """(sample numbers, device time in us of sample 0, rate in Hz, values (samples, channels)) of one segment."""
@@ -274,6 +276,8 @@ def _metadata(log, number, start, index) -> dict:
     flat["segment"] = number
     flat["lost_samples"] = int(index[-1] - index[0] + 1 - len(index))
     flat["ended"] = (log.end or {}).get("reason", "without an end: the recorder was killed or the tail is damaged")
+    if not start:
+        flat["start"] = "damaged: the rate is from the device's clock, and the transient is not cut off"
     if log.damage:
         flat["damaged_bytes"] = int(sum(n for _, n in log.damage))
     return flat

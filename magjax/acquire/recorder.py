@@ -332,7 +332,8 @@ class Recorder:
         t["repeats"] += tracker.repeats
         row = {"segment": self.segment, "received": received, "lost": lost, "sent": sent, "gaps": len(tracker.gaps)}
         self.tracker = None
-        self.log.event("counts", **row, tail_known=self.final is not None)
+        told = {"rate_Hz": tracker.rate} if tracker.rate else {}  # again, should the start event be damaged
+        self.log.event("counts", **row, tail_known=self.final is not None, **told, **self.order.about)
 
     def _stop_device(self):
         """STOP until FINAL comes; the drive is at zero then."""

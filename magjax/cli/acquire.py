@@ -256,7 +256,8 @@ def _run_plan(options, arguments) -> int:
         made = campaign(options, arguments, "record", live, lambda text: None if quiet else print(text, file=sys.stderr))
         made.settings = plan.settings
         made.check_limits(entries(plan))
-        rows = made.run(entries(plan, made.rate_max()))
+        found = entries(plan, made.rate_max())
+        rows = made.run(found)
     status = max((r["status"] for r in rows), key=lambda s: (s in (5, 130), s))
     good = sum(r["status"] == 0 for r in rows)
     if options.json:
@@ -264,7 +265,8 @@ def _run_plan(options, arguments) -> int:
     else:
         for row in rows:
             print(f"  {row['name']:32s} {'good' if not row['problems'] else row['problems'][0]}")
-        print(f"{good} of {len(rows)} recordings are fit to use, in {options.out}")
+        rest = "" if len(rows) == len(found) else "; the same command goes on where it ended"
+        print(f"{good} of {len(found)} recordings are fit to use, in {options.out}{rest}")
     return status
 
 

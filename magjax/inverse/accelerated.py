@@ -21,6 +21,11 @@ def invert_many(operator, targets, slope: float = 0.0):
     """
     sequence, _ = _kernel()
     targets = np.ascontiguousarray(targets, dtype=float)
+    if np.isnan(targets).any() or not slope >= 0:
+        at = int(np.argmax(np.isnan(targets))) if np.isnan(targets).any() else 0
+        raise ConfigurationError(
+            f"target {targets[at]} at sample {at} with slope {slope}; give numbers, and a slope of zero or more"
+        )
     *arrays, stack = _arrays(operator)
     fields, values, saturated = np.empty(len(targets)), np.empty(len(targets)), np.zeros(len(targets), np.bool_)
     count, excess = sequence(*arrays, stack, len(operator.extrema), targets, float(slope), fields, values, saturated)

@@ -155,6 +155,11 @@ def current_for_displacement(plant: PlainActuator, displacement, h: float, of_re
     the operator is inverted by the compiled walk (needs numba; the same numbers). Returns
     (current, infeasible samples, saturated samples). Of the effects, those in `KNOWN_INVERSES` are compensated.
     """
+    displacement = np.asarray(displacement, float)
+    if not 0 < h < np.inf:
+        raise ConfigurationError(f"h = {h} s; give a positive sample time")
+    if displacement.ndim != 1 or len(displacement) < 4 or not np.all(np.isfinite(displacement)):
+        raise ConfigurationError("the wanted displacement must be one row of four samples or more, all of them numbers, in m")
     wanted, infeasible = feasible_magnetization(plant, undo_sensor(plant, displacement, h) if of_reading else displacement, h)
     operator = plant.operator.copy()
     if accelerate:

@@ -91,6 +91,8 @@ class HeldCurrent:
     def advance(self, current: float, duration: float) -> float:
         """Field and memory alone under a held current; returns the field, A/m."""
         operator, plant = self.operator, self.plant
+        if not (math.isfinite(current) and 0 <= duration < math.inf):
+            raise ConfigurationError(f"a current of {current} A held for {duration} s; give numbers, the time not negative")
         k = plant.c1 / plant.c0
         goal = plant.c0 * current + plant.H_bias
         left, self.events = k * duration, 0

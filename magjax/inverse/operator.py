@@ -22,9 +22,16 @@ class PlainPreisach:
     """
 
     def __init__(self, masses, low: float, high: float, offset: float = 0.0, history=()):
-        masses = np.tril(np.asarray(masses, float))
-        if masses.ndim != 2 or masses.shape[0] != masses.shape[1]:
+        masses = np.asarray(masses, float)
+        if masses.ndim != 2 or masses.shape[0] != masses.shape[1] or masses.size == 0:
             raise ConfigurationError(f"masses must be L x L, not {masses.shape}")
+        if not np.all(np.isfinite(masses)) or np.any(np.triu(masses, 1)):
+            row, column = np.argwhere(~np.isfinite(masses) | (np.triu(masses, 1) != 0))[0]
+            raise ConfigurationError(
+                f"masses[{row}, {column}] = {masses[row, column]:g}; give numbers, zero above the diagonal (beta <= alpha)"
+            )
+        if not -math.inf < low < high < math.inf or not math.isfinite(offset):
+            raise ConfigurationError(f"the Preisach plane {low} .. {high} A/m with offset {offset} A/m; give low < high")
         if masses.min() < 0:
             row, column = np.unravel_index(int(masses.argmin()), masses.shape)
             raise ConfigurationError(
@@ -102,6 +109,8 @@ class PlainPreisach:
 
     def apply(self, field: float) -> float:
         """Lead the field to a new value (clipped to the plane); returns M, A/m."""
+        if field != field:
+            raise ConfigurationError("the field is NaN; mend the drive first")
         field = min(max(float(field), self.low), self.high)
         if field == self.field:
             return self.magnetization
@@ -126,11 +135,14 @@ class PlainPreisach:
         """The field v with slope * v + M(v) = target, and the memory led there; `slope` = 0 inverts M itself, (6).
 
         Out of range: the nearest end of the plane with `saturated` set. On a plateau the nearest field, `unique` False.
+        Raises `ConfigurationError` for NaN, and keeps the memory.
         """
         self.saturated, self.unique, self.iterations = False, True, 0
         value = slope * self.field + self.magnetization
         if target == value:
             return self.field
+        if target != target or not slope >= 0:
+            raise ConfigurationError(f"target {target} with slope {slope}; give a number, and a slope of zero or more")
         rising = target > value
         while True:
             start = self.field
@@ -198,10 +210,13 @@ class PlainPreisach:
 
     def invert(self, targets, accelerate: bool = False) -> np.ndarray:
         """Fields for a sequence of wanted M, A/m, carrying the memory along; `accelerate`: compiled by numba."""
+        targets = np.asarray(targets, float)
+        if np.isnan(targets).any():
+            raise ConfigurationError(f"target nan at sample {int(np.argmax(np.isnan(targets)))}; give numbers")
         if accelerate:
             from .accelerated import invert_many
 
             fields, _, saturated, _ = invert_many(self, targets)
             self.saturated = bool(saturated[-1]) if len(saturated) else False
             return fields
-        return np.array([self.solve(float(m)) for m in np.asarray(targets, float)])
+        return np.array([self.solve(float(m)) for m in targets])

@@ -159,3 +159,25 @@ except DiskFull as error:
     log = mjlog.Log(tmp_path / "full.mjlog")
     assert log.samples == count > 0 and not log.damage and status == 6
     assert (tmp_path / "full.mjlog").stat().st_size == written
+
+
+def test_a_damaged_start_is_told_by_the_counts_at_the_end(tmp_path):
+    """Else the rate would be guessed and the transient read as if it were settled."""
+    path = tmp_path / "a.mjlog"
+    writer = mjlog.LogWriter(path, HEADER)
+    about = {"segment": 0, "rate_Hz": 5000.0, "frequency_Hz": 50.0, "settle_samples": 200}
+    writer.event("start", **about)
+    writer.data(0, 0, (0, 100), samples(800))
+    writer.event("counts", **about, received=800)
+    writer.close()
+    whole = path.read_bytes()
+    ((table, metadata),) = mjlog.read_log(path)
+    starts = [at for at, kind, *_ in mjlog.chunks(whole) if kind == mjlog.EVENT]
+    content = bytearray(whole)
+    content[starts[0] + 40] ^= 1
+    path.write_bytes(content)
+    ((damaged, about),) = mjlog.read_log(path)
+    assert len(table["time_s"]) == 600 and np.array_equal(table["time_s"], damaged["time_s"]) and about["damaged_bytes"] > 0
+    content[starts[1] + 40] ^= 1
+    path.write_bytes(content)
+    assert "transient is not cut off" in mjlog.read_log(path)[0][1]["start"]

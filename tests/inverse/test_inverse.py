@@ -8,6 +8,7 @@ import pytest
 from magjax.effects import AmplifierLag
 from magjax.errors import ConfigurationError
 from magjax.inverse import PlainActuator, PlainPreisach, current_for_displacement, implicit_euler
+from magjax.inverse.events import HeldCurrent
 from magjax.preisach import Preisach
 from magjax.simulate import simulate
 from tests.test_simulate import actuator
@@ -163,3 +164,41 @@ def test_invert_command_offers_the_nearest_and_refuses_uneven_time(tmp_path, cap
     assert out.read_text().startswith("time_s,current_A\n")
     assert main(["invert", str(tmp_path / "uneven.csv"), "--out", str(out)]) == 3
     assert "not uniform at sample 300" in capsys.readouterr().err
+
+
+def test_what_is_no_number_is_refused_and_the_memory_kept():
+    nan = float("nan")
+    plain, _, _ = random_operator(3)
+    plain.solve(0.3)
+    before = list(plain.extrema)
+    for ask in (
+        lambda: plain.solve(nan),
+        lambda: plain.apply(nan),
+        lambda: plain.solve(0.5, -1.0),
+        lambda: plain.invert([0.1, nan]),
+    ):
+        with pytest.raises(ConfigurationError, match="NaN|number"):
+            ask()
+    assert plain.extrema == before
+    for masses, low, high in (
+        (np.full((3, 3), nan), 0, 1), (np.ones((3, 3)), 0, 1), (np.ones(3), 0, 1), (np.zeros((0, 0)), 0, 1), (np.eye(3), 1, 0), (np.eye(3), 0, nan),
+    ):  # fmt: skip
+        with pytest.raises(ConfigurationError, match="give numbers|L x L|give low < high"):
+            PlainPreisach(masses, low, high)
+    plant = PlainActuator.from_actuator(actuator(12))
+    for wanted, h in (
+        ([1e-5, nan, 1e-5, 1e-5], 1e-4),
+        ([1e-5] * 4, nan),
+        ([1e-5] * 4, 0.0),
+        ([1e-5], 1e-4),
+        (np.ones((4, 4)), 1e-4),
+    ):
+        with pytest.raises(ConfigurationError, match="sample time|four samples"):
+            current_for_displacement(plant, wanted, h)
+    held = HeldCurrent(plant)
+    for current, duration in ((nan, 1e-4), (0.1, nan), (0.1, -1.0), (np.inf, 1e-4)):
+        with pytest.raises(ConfigurationError, match="give numbers"):
+            held.hold(current, duration)
+    if importlib.util.find_spec("numba"):
+        with pytest.raises(ConfigurationError, match="at sample 1"):
+            plain.invert([0.1, nan], accelerate=True)
