@@ -17,12 +17,12 @@ from .problem import TrackingProblem, response
 
 BACK_OFF = 3e-7  # HiGHS works to 1e-7: hard rows are asked for with this to spare, more where that was not enough
 MOST_TAIL = 4000
+CLOSE = 1e-6  # relative gap that needs no better lower bound
 
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """A certified design. `Q`: taps; `gamma`, `lower`: bounds of gamma*, um (`lower` is NaN for an unstable plant, where it
-    is not certified); `norms`: l1 norms re-evaluated from Q:
+    """A certified design. `Q`: taps; `gamma`, `lower`: bounds of gamma*, um; `norms`: l1 norms re-evaluated from Q:
     error_r, error_w (um), control_r, control_w (M_s^2), robust; `seconds`: of the programmes."""
 
     problem: TrackingProblem
@@ -107,6 +107,13 @@ class Channels:
 
     def _delay(self, matrix):
         return sp.vstack([sp.csr_array((1, matrix.shape[1])), matrix[:-1]]).tocsr()
+
+    def exact(self, x):
+        """The nearest pair that satisfies the Bezout identity to rounding, not to HiGHS's 1e-7; Q is left as it is."""
+        if self.equalities is None:
+            return x
+        A, b = self.equalities[0].toarray(), self.equalities[1]
+        return x + np.linalg.lstsq(A, b - A @ x, rcond=None)[0]
 
     def norms(self, x) -> dict:
         """l1 norm of each channel."""
@@ -197,12 +204,15 @@ def design(problem: TrackingProblem = None, taps: int = 40) -> Design:
             _refuse(full, problem)
         if found.status != 0:
             raise ConfigurationError(f"the linear programme ended with: {found.message}; scale the problem or change taps")
-        x = found.x[: full.columns]
+        x = full.exact(found.x[: full.columns])
         norms = full.norms(x)
         if norms["control_r"] + norms["control_w"] <= problem.u_bar and norms.get("robust", 0.0) <= 1:
             break
-    gamma = norms["error_r"] + norms["error_w"]
-    lower = lower_bound(problem, taps, gamma) if not full.unstable else np.nan
+    gamma, lower = norms["error_r"] + norms["error_w"], 0.0
+    for rows in (taps, 2 * taps, 4 * taps):  # the taps may be enough and the rows not
+        lower = max(lower, lower_bound(problem, rows, gamma))
+        if gamma - lower <= CLOSE * gamma:
+            break
     if not full.unstable:
         return Design(problem, x, gamma, lower, norms, time.perf_counter() - begin)
     # K = d_s X / V without the unstable poles that Q/(1 - lambda G_a Q) would cancel

@@ -2,7 +2,8 @@
 
 The first N samples of every closed loop depend on the first N taps of Q alone, so a programme over them bounds the
 optimum from below. Its multipliers certify it whatever their rounding, provided that the variables are bounded: ||Q||_1
-by the saturation row, by the robustness row where 1/W_0 is stable, or by the tracking error where 1/g is. A plant with
+by the saturation row, by the robustness row where 1/W_0 is stable, or by the tracking error where 1/g is. For an unstable
+plant the pair X, V of the Bezout identity is bounded instead (`sizes_of_pair`). A plant with
 zeros inside the disc and neither row needs the interpolation conditions S(zero) = 1 instead, S = 1 - g Q, since cut rows
 cannot see them (Dahleh and Diaz-Bobillo, Control of Uncertain Systems, 1995).
 """
@@ -18,21 +19,52 @@ from .problem import TrackingProblem, response, roots_of
 SERIES = 200000  # terms of 1/W_0, whose zero lies as near to the circle as 1.0005
 
 
-def lower_bound(problem: TrackingProblem, taps: int, gamma: float) -> float:
-    """A number below gamma*, um, for a stable plant; `gamma`: the upper bound already reached."""
+def lower_bound(problem: TrackingProblem, rows: int, gamma: float) -> float:
+    """A number below gamma*, um, from the first `rows` samples; `gamma`: the upper bound already reached. 0 where nothing bounds Q."""
+    if len(problem.factors()[2]) > 1:
+        sizes = sizes_of_pair(problem, gamma)
+        return _cut_rows(problem, rows, gamma, np.repeat(sizes, rows)) if np.all(np.isfinite(sizes)) else 0.0
     most = size_of_q(problem, gamma)
-    best = 0.0 if most is None else _cut_rows(problem, taps, gamma, most)
+    best = 0.0 if most is None else _cut_rows(problem, rows, gamma, most)
     if gamma - best > 1e-7 * gamma:
-        best = max(best, _by_interpolation(problem, taps, gamma))
+        best = max(best, _by_interpolation(problem, rows, gamma))
     return best
 
 
-def _cut_rows(problem, taps, gamma, most):
-    found, parts = programme(Channels(problem, taps, taps), problem.u_bar, 0.0, bound=most)
+def _cut_rows(problem, rows, gamma, most):
+    found, parts = programme(Channels(problem, rows, rows), problem.u_bar, 0.0, bound=most)
     if found.status != 0:
         return 0.0
-    largest = max(most, problem.u_bar if np.isfinite(problem.u_bar) else 0.0, 2 * gamma, 1.0, problem.w_bar * most)
+    widest = float(np.max(most))
+    largest = max(widest, problem.u_bar if np.isfinite(problem.u_bar) else 0.0, 2 * gamma, 1.0, problem.w_bar * widest)
     return max(dual_bound(found, parts, largest), 0.0)
+
+
+def sizes_of_pair(problem: TrackingProblem, gamma: float) -> tuple[float, float]:
+    """What ||X||_1 and ||V||_1 of the Bezout pair cannot exceed in a loop with a tracking error below `gamma`; inf if unknown.
+
+    T = lambda^2 n X has ||T|| <= 1 + gamma/r_bar and vanishes at the zeros inside the disc, S = 1 - T = d_u V at the unstable
+    poles, Q = d X at those too. A series that vanishes at p, divided by 1 - lambda/p, grows by |p|/(1 - |p|) at most.
+    """
+    n, d_s, d_u = problem.factors()
+    poles = roots_of(d_u)
+    loop, grows = 1 + gamma / problem.r_bar, _growth(poles)
+    V = (1 + loop) * grows
+    zeros = roots_of(n) if len(np.trim_zeros(n)) > 1 else np.array([])
+    inside, outside = zeros[np.abs(zeros) < 1], zeros[np.abs(zeros) >= 1]
+    outer = np.trim_zeros(n, "f")[0] * np.real(np.poly(1 / outside)) if len(outside) else np.trim_zeros(n, "f")[:1]
+    X = [loop * _norm_of_inverse(outer, [1.0]) * _growth(inside[np.abs(inside) > 1e-12])]
+    stable = _norm_of_inverse(d_s, [1.0]) * grows
+    if np.isfinite(problem.u_bar):
+        X.append(problem.u_bar / problem.r_bar * stable)
+    if problem.robust:
+        X.append(_norm_of_inverse(*problem.weight) * stable)
+    return min(X), V
+
+
+def _growth(points) -> float:
+    size = np.abs(points)
+    return float(np.prod(size / (1 - size)))
 
 
 def size_of_q(problem: TrackingProblem, gamma: float) -> float | None:

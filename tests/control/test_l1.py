@@ -185,6 +185,34 @@ def test_interpolation_with_few_taps_leaves_room_for_the_rest():
     assert short.lower <= long.gamma and long.gap < 1e-5
 
 
+UNSTABLE = [
+    ([1.0], [1.0, -1.5], 6.0), ([1.0], [1.0, -1.5], np.inf), ([1.0, -2.0], np.convolve([1.0, -1.25], [1.0, -0.3]), 500.0),
+    ([1.0, 0.2], np.convolve([1.0, -1.5], [1.0, -1.2]), np.inf), ([1.0, 0.2], [1.0, -1.8353, 1.44], 60.0),
+    ([1.0], np.convolve([1.0, -1.3], [1.0, -1.3]), 100.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("numerator", "denominator", "u_bar"), UNSTABLE)
+def test_unstable_plants_are_certified_from_below_too(numerator, denominator, u_bar):
+    plant = (np.array(numerator), np.array(denominator))
+    problem = TrackingProblem(plant=plant, r_bar=1.0, w_bar=0.1, u_bar=u_bar, robust=False)
+    short, made = design(problem, taps=10), design(problem, taps=40)
+    assert -1e-9 <= made.gap < 1e-6 and short.lower <= made.gamma * (1 + 1e-9) and short.gamma >= made.lower * (1 - 1e-9)
+
+
+def test_an_unstable_plant_in_closed_form():
+    """g = 1/(1 - 3/2 lambda) without noise: T = lambda^2 X must be 1 at 2/3, so that the least |lambda^2 - T| is 9/4 - 1."""
+    plant = (np.array([1.0]), np.array([1.0, -1.5]))
+    made = design(TrackingProblem(plant=plant, r_bar=1.0, w_bar=1e-9, u_bar=np.inf, robust=False))
+    assert made.gamma == pytest.approx(1.25, rel=1e-7) and made.lower == pytest.approx(1.25, rel=1e-7)
+
+
+@pytest.mark.parametrize("times", [20, 30, 100])
+def test_a_large_uncertainty_is_certified_at_forty_taps(times):
+    made = design(TrackingProblem(weight=weight(times * C_W_UM), u_bar=7.5), taps=40)
+    assert len(made.Q) == 40 and 0 <= made.gap <= 1e-6 and made.norms["robust"] <= 1
+
+
 def test_no_jax_behind_inversion_and_control():
     root = Path(__file__).resolve().parents[2] / "magjax"
     for path in [*root.glob("control/*.py"), *root.glob("inverse/*.py")]:
