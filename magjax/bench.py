@@ -1,7 +1,7 @@
 """The bench file (TOML): constants, which blocks there are, which column is which quantity, what is free.
 
 A bench with [magnetostriction] and [mechanics] ends at displacement and is driven by current; one whose [coil] holds
-k_eddy is driven by a known field and ends at flux density.
+k_eddy is driven by a known field and ends at flux density. With output = "strain" a table of strain curves is read, no recording.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ OTHER_KEYS = {
     "fit": ("free", "output", "priors"),
 }
 COLUMN_KEYS = ("name", "scale", "offset", "unit", "split", "merge", "quasistatic", "emf_turns", "emf_area", "emf_sign", "bits", "gain_accuracy")
-QUANTITIES = ("time", "current", "field", "displacement", "flux_density", "magnetization", "voltage", "temperature")
+QUANTITIES = ("time", "current", "field", "displacement", "flux_density", "magnetization", "voltage", "temperature", "strain", "stress")
 STARTS = ("auto", "demagnetized", "negative_saturation", "positive_saturation")
 
 

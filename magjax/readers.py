@@ -20,6 +20,8 @@ UNITS = {
     "magnetization": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3},
     "voltage": {"V": 1.0, "mV": 1e-3},
     "temperature": {"degC": 1.0, "K": 1.0},
+    "strain": {"1": 1.0, "ppm": 1e-6},
+    "stress": {"Pa": 1.0, "MPa": 1e6},
 }
 # what no bench of this kind exceeds: (largest sensible absolute value, usual wrong unit)
 SENSIBLE = {"current": (60.0, "mA"), "displacement": (5e-3, "um"), "flux_density": (4.0, "mT"), "field": (5e6, "Oe")}
@@ -40,8 +42,22 @@ def load_recordings(paths, bench) -> list[Recording]:
     return recordings
 
 
+def read_columns(path: Path, bench, quantities) -> dict:
+    """Columns of one table as they stand, without a time axis: quantity -> values in SI, for those that it holds."""
+    table, _ = _read_table(Path(path))[0]
+    found = {q: _find(path, table, q, bench.columns.get(q, {}), required=q == bench.output) for q in quantities}
+    return {q: v for q, v in found.items() if v is not None}
+
+
 def read_file(path: Path, bench) -> list[Recording]:
     """All recordings in one file."""
+    tables = _read_table(path)
+    origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    return [r for table, metadata in tables for r in _recordings(path, table, {**origin, "metadata": metadata}, bench)]
+
+
+def _read_table(path: Path) -> list:
+    """(columns, metadata) of every table in a file; one line says what is wrong with it."""
     if not path.exists():
         raise RecordingError(f"{path}: no such file; check the name")
     if path.is_dir():
@@ -51,13 +67,11 @@ def read_file(path: Path, bench) -> list[Recording]:
     suffix = path.suffix.lower()
     reader = {".nc": _read_netcdf, ".mat": _read_mat, ".mjlog": _read_log}.get(suffix, _read_csv)
     try:
-        tables = reader(path) if suffix == ".mjlog" else [reader(path)]
+        return reader(path) if suffix == ".mjlog" else [reader(path)]
     except MagjaxError:
         raise
     except (OSError, ValueError, KeyError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read as {suffix[1:] or 'CSV'} ({error})") from None
-    origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-    return [r for table, metadata in tables for r in _recordings(path, table, {**origin, "metadata": metadata}, bench)]
 
 
 def _read_csv(path):
@@ -190,7 +204,7 @@ def _find(path, table, quantity, column, required):
         matches = [n for n in table if _parse(n)[0] == quantity]
         if not matches:
             if required:
-                usual = {"current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m"}.get(quantity, "flux_density_T")
+                usual = {"current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm"}.get(quantity, "flux_density_T")
                 raise RecordingError(
                     f"{path}: no {quantity} column among {', '.join(table)}; name it {usual} or map it in [columns.{quantity}] of the bench"
                 )

@@ -103,6 +103,8 @@ def run_diagnose(arguments) -> int:
 
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
+    if bench.output == "strain":
+        return _diagnose_strain(options, bench, folder)
     from fitting.diagnose import Diagnosis, diagnose
     from fitting.setup import Choices
 
@@ -130,6 +132,30 @@ def run_diagnose(arguments) -> int:
         if folder:
             print(f"\nresults in {folder} (report.html, diagnosis.json)")
     return 3 if found.verdict == "data_problem" else 0
+
+
+def _diagnose_strain(options, bench, folder) -> int:
+    """Strain curves have a law, not a history: a diagnosis of their own."""
+    from fitting.result import write_atomically
+    from fitting.strain_law import diagnose_strain, draw_strain, load_curves, strain_verdict
+
+    curves = load_curves(options.recordings, bench)
+    with Progress(options.quiet or options.json) as progress:
+        progress("laws of magnetostriction, each curve left out in turn")
+        content = strain_verdict(curves)
+        if folder:
+            law, tried = diagnose_strain(curves)
+            write_atomically(folder / "diagnosis.json", json.dumps(content, indent=1))
+            draw_strain(curves, law, tried["square", None], folder / "strain.png")
+    if options.json:
+        print(json.dumps(content))
+    else:
+        print(f"{content['verdict']}: {content['message']}")
+        for row in content["laws"][:8]:
+            print(f"  {row['law']:8s} {row['variable'] or 'no variable':14s} rms {row['rms']:.3g}, on curves left out {row['held_out_rms']:.3g}")
+        if folder:
+            print(f"\nresults in {folder} (diagnosis.json, strain.png)")
+    return 0
 
 
 def run_demo(arguments) -> int:
