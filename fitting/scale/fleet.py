@@ -101,9 +101,13 @@ def fit_fleet(
     must see the same paths. A folder whose files have changed since the checkpoint is fitted again; folders may be added.
     Raises `ConfigurationError` where there is no folder or a folder comes twice.
     """
-    found = [Path(f) for f in folders if Path(f).is_dir()]
+    paths = [Path(f) for f in folders]
+    for path in paths:
+        if not path.exists():
+            raise ConfigurationError(f"{path}: no such folder; check the name")
+    found = [p for p in paths if p.is_dir()]  # DIR/* may name files too
     if not found:
-        raise ConfigurationError(f"no folder among {len(list(folders))} paths; give one folder of recordings for each actuator")
+        raise ConfigurationError(f"no folder among {len(paths)} paths; give one folder of recordings for each actuator")
     bench = None if bench is None else load_bench(bench)
     chunks = tuple(Chunk(str(f), {"folder": str(f.resolve()), "files": _files(f)}) for f in found)
     inputs = {"bench": bench, "choices": choices, "models": models}

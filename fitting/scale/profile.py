@@ -22,6 +22,7 @@ from .refit import lean, settle
 HOLD = 1e4  # how much stiffer a held parameter is than the data hold it
 SOLVES = 10  # for each end of an interval
 CLOSE = 0.02  # of the root of the quantile
+LOWER = 0.2  # of 2 cost, by which a profile may fall below the fit before it is said
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,6 +153,8 @@ def walk(inputs, item, rng):
         points.append((float(layout.value(name, jnp.asarray(z))), float(rise)))
         if not found.converged:
             note = "a refit did not settle"
+        elif rise < -LOWER:
+            note = "lower cost than at the fit: the fit has not settled, or the misfit is large"
         if abs(height / root - 1) < CLOSE:
             return _end(points[-1][0], True, note, points)
         if height < root:

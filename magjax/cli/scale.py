@@ -1,7 +1,6 @@
 """What commands that scale share: where the work runs, the checkpoint, intervals of a fit, fleets."""
 
 import json
-from pathlib import Path
 
 from magjax.errors import ConfigurationError
 
@@ -75,10 +74,9 @@ def run_fleet(options, choices, folder, progress) -> int:
     from fitting.result import write_atomically
     from fitting.scale import fit_fleet
 
-    folders = [f for f in options.fleet if Path(f).is_dir()]
     with progress:
         fleet = fit_fleet(
-            folders, options.bench, choices=choices, executor=executor_of(options), checkpoint=options.checkpoint,
+            options.fleet, options.bench, choices=choices, executor=executor_of(options), checkpoint=options.checkpoint,
             progress=progress, models=bool(folder or options.checkpoint),
         )  # fmt: skip
     if folder:

@@ -17,6 +17,7 @@ from ..errors import ConfigurationError
 from .worker import begin, pack, perform_opened, perform_packed
 
 TRIES = 3  # workers that one chunk may cost
+PATIENCE = 10.0  # s, for a dask scheduler to answer
 KINDS = '"processes:N", "dask:ADDRESS", a dask.distributed Client or a concurrent.futures Executor'
 
 
@@ -58,8 +59,33 @@ class InProcess:
             yield chunk, perform(work, inputs, item, entropy)
 
 
+class _Worker:
+    """A spawned process (JAX does not survive a fork) behind a pool of one, with the inputs of a job."""
+
+    def __init__(self, key: str, blob: bytes):
+        self.key = key
+        self.pool = concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+        self.started = self.pool.submit(begin, key, blob)
+
+    def give(self, work, task):
+        """Begin a chunk; raises `BrokenProcessPool` where the process died while it waited."""
+        return self.pool.submit(perform_opened, work, self.key, *task[1:])
+
+    def result(self, future):
+        """The encoded result; what went wrong when the process began comes first."""
+        self.started.result()
+        return future.result()
+
+    def leave(self, busy: bool):
+        """Let the process go, at once where it is busy for nobody."""
+        self.pool.shutdown(wait=not busy, cancel_futures=True)
+        if busy and self.started.done() and self.started.exception() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.started.result(), signal.SIGTERM)
+
+
 class Processes:
-    """`count` fresh processes (spawned: JAX does not survive a fork), one pool of one process each.
+    """`count` fresh processes, one pool of one process each.
 
     A pool breaks as a whole when a process of it dies; with one process a pool the death of a worker costs the chunk that it
     was at and no other, and the chunk is known. The chunk is given to a fresh process, three times at most.
@@ -67,54 +93,50 @@ class Processes:
 
     def __init__(self, count: int):
         self.count, self.lost = count, 0
-        self._alive: dict[object, int] = {}
 
     def run(self, name, work, inputs, tasks):
         """See the module."""
         blob = pack(inputs)
         key = hashlib.sha256(blob).hexdigest()
-        waiting, cost, running = deque(tasks), Counter(), {}
-        idle = [None] * min(self.count, len(tasks))
+        waiting, cost = deque(tasks), Counter()
+        idle, running = [], {}
         try:
             while waiting or running:
-                while waiting and idle:
-                    pool = idle.pop() or self._fresh()
-                    first = pool not in self._alive
-                    task = waiting.popleft()
-                    opened = pool.submit(begin, key, blob) if first else None
-                    running[pool.submit(perform_opened, work, key, *task[1:])] = (pool, task, opened)
+                while waiting and len(running) < self.count:
+                    worker = idle.pop() if idle else _Worker(key, blob)
+                    try:
+                        running[worker.give(work, waiting[0])] = (worker, waiting[0])
+                    except BrokenProcessPool:  # died between two chunks: costs none
+                        self._bury(name, worker, cost, None)
+                    else:
+                        waiting.popleft()
                 done, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
                 for future in done:
-                    pool, task, opened = running.pop(future)
+                    worker, task = running.pop(future)
                     try:
-                        if opened is not None:
-                            self._alive[pool] = opened.result()
-                        result = future.result()
+                        result = worker.result(future)
                     except BrokenProcessPool:
-                        self._alive.pop(pool, None)
-                        pool.shutdown(wait=False)
-                        pool = None
-                        cost[task[0]] += 1
-                        self.lost += 1
-                        if cost[task[0]] == TRIES:
-                            words = f"ended its worker {TRIES} times (killed, out of memory, or the script lacks its `if __name__ == \"__main__\":`)"
-                            raise _given_up(name, task[0], words) from None
+                        self._bury(name, worker, cost, task[0])
                         waiting.appendleft(task)
                     else:
+                        idle.append(worker)
                         yield task[0], result
-                    idle.append(pool)
         finally:
-            for pool in idle:
-                if pool is not None:
-                    pool.shutdown()
-            for pool, _, _ in running.values():  # left early: a busy worker would finish its chunk for nobody
-                pool.shutdown(wait=False, cancel_futures=True)
-                if pool in self._alive:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(self._alive[pool], signal.SIGTERM)
+            for worker in idle:
+                worker.leave(busy=False)
+            for worker, _ in running.values():
+                worker.leave(busy=True)
 
-    def _fresh(self):
-        return concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+    def _bury(self, name, worker, cost, chunk):
+        """Count a dead worker; give up where a chunk has cost too many, or where all die between chunks."""
+        worker.leave(busy=False)
+        self.lost += 1
+        cost[chunk] += 1
+        if chunk is not None and cost[chunk] == TRIES:
+            words = f'ended its worker {TRIES} times (killed, out of memory, or the script lacks its `if __name__ == "__main__":`)'
+            raise _given_up(name, chunk, words) from None
+        if cost[None] > TRIES * self.count:
+            raise _given_up(name, "(none)", "was begun: workers die while they wait") from None
 
 
 class Foreign:
@@ -186,6 +208,6 @@ class Dask:
 
     def _connect(self):
         try:
-            return self.library.Client(self.where, timeout="10s", set_as_default=False)
+            return self.library.Client(self.where, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             raise ConfigurationError(f"no dask scheduler answers at {self.where} ({error}); start one (dask scheduler) and give its address") from None

@@ -9,7 +9,9 @@ import signal
 import sys
 import threading
 
-SETTINGS = ("jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_default_matmul_precision")
+SETTINGS = (
+    "jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_default_matmul_precision", "jax_platforms",
+)  # fmt: skip
 
 _opened: dict[str, object] = {}  # digest -> inputs of the job at hand; one at a time
 _guard = threading.Lock()
@@ -25,8 +27,9 @@ def settings() -> dict:
 
 
 def take_over(found: dict) -> None:
-    """Apply another process's settings."""
-    if not found:
+    """Apply another process's settings: by the environment where JAX is not imported yet (work may do without it)."""
+    if "jax" not in sys.modules:
+        os.environ.update({name.upper(): str(value) for name, value in found.items() if value is not None})
         return
     import jax
 

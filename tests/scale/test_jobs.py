@@ -82,6 +82,37 @@ def test_a_chunk_that_kills_every_worker_is_given_up(tmp_path):
     assert mended.resumed == 2
 
 
+def test_a_worker_killed_between_two_chunks_costs_none(plain):
+    """The consumer holds the engine at a result: its worker is idle then."""
+    from magjax.scale.engines import Processes
+
+    engine, one = Processes(1), job(works.named)
+    tasks = [(c.id, c.item, one.entropy(c)) for c in one.chunks]
+    found = {}
+    for chunk, result in engine.run("test", one.work, one.inputs, tasks):
+        if chunk == "item 3":
+            os.kill(result["worker"], signal.SIGKILL)
+            while alive(result["worker"]):
+                time.sleep(0.05)
+            time.sleep(0.5)  # until the pool has noticed
+        found[chunk] = {**result, "worker": None}
+    assert engine.lost == 1 and same([decode(found[c.id]) for c in one.chunks], plain)
+
+
+@pytest.mark.parametrize("executor", ["processes:2", None])
+def test_a_job_left_early_leaves_no_worker(tmp_path, executor):
+    def stop(text, done, _):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_job(job(works.counted, folder=str(tmp_path), seconds=0.2), executor, progress=stop)
+    workers = {int(line.split()[1]) for line in (tmp_path / "ran.txt").read_text().splitlines()} - {os.getpid()}
+    limit = time.time() + 10
+    while any(map(alive, workers)) and time.time() < limit:
+        time.sleep(0.05)
+    assert not any(map(alive, workers))
+
+
 @pytest.mark.parametrize("executor", [None, "processes:1"])
 def test_an_error_of_the_work_comes_through(tmp_path, executor):
     with pytest.raises(ValueError, match="item 2 cannot"):
@@ -202,6 +233,14 @@ def test_results_lose_no_bit():
     assert np.isnan(decode(json.loads(json.dumps(encode(float("nan"))))))
     with pytest.raises(TypeError, match="not set"):
         encode({1, 2})
+
+
+@pytest.mark.parametrize("executor", [None, "processes:1"])
+def test_workers_take_over_the_settings_of_jax(executor):
+    found = run_job(job(works.precision, count=1), executor).results[0]
+    import jax
+
+    assert found == {"dtype": "float64", "cache": jax.config.jax_compilation_cache_dir, "least": 0.3}
 
 
 def test_digests_tell_contents_apart():

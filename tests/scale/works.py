@@ -14,6 +14,11 @@ def spectrum(inputs, item, rng):
     return {"item": item, "lines": np.abs(np.fft.rfft(inputs["signal"] + noise)), "mean": float(noise.mean()), "worker": None}
 
 
+def named(inputs, item, rng):
+    """As `spectrum`, with the number of the process."""
+    return {**spectrum(inputs, item, rng), "worker": os.getpid()}
+
+
 def counted(inputs, item, rng):
     """As `spectrum`, leaving a trace of each run in a folder."""
     with open(Path(inputs["folder"]) / "ran.txt", "a") as trace:
@@ -43,3 +48,11 @@ def refusing(inputs, item, rng):
     if item == 2:
         raise ValueError("item 2 cannot be done")
     return spectrum(inputs, item, rng)
+
+
+def precision(inputs, item, rng):
+    """What JAX is set to in the worker."""
+    import jax
+
+    least = jax.config.jax_persistent_cache_min_compile_time_secs
+    return {"dtype": str(jax.numpy.asarray(0.1).dtype), "cache": jax.config.jax_compilation_cache_dir, "least": least}
