@@ -124,7 +124,7 @@ def simulate_summary(plant, options) -> dict:
         np.savetxt(out, table, delimiter=",", header="time_s,wanted_m,reached_m,current_A", comments="", fmt="%.10g")
     except OSError as error:
         raise ConfigurationError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
-    text = f"{options.strategy}: rms error {rms * 1e6:.3g} um, largest {largest * 1e6:.3g} um, "
+    text = f"{options.strategy} at T = {time[1] - time[0]:.4g} s: rms error {rms * 1e6:.3g} um, largest {largest * 1e6:.3g} um, "
     text += f"{run.saturated:.0%} of the samples at a limit; wrote {out}"
     return {"rms_m": rms, "largest_m": largest, "saturated": run.saturated, "file": str(out), "message": text}
 

@@ -17,6 +17,7 @@ from .problem import TrackingProblem, response
 
 BACK_OFF = 3e-7  # HiGHS works to 1e-7: hard rows are asked for with this to spare, more where that was not enough
 MOST_TAIL = 4000
+MOST_TAPS = 1000  # beyond, the programme takes minutes
 CLOSE = 1e-6  # relative gap that needs no better lower bound
 
 
@@ -194,8 +195,8 @@ def design(problem: TrackingProblem = None, taps: int = 40) -> Design:
     from .lower import lower_bound
 
     problem = TrackingProblem() if problem is None else problem
-    if taps < 4:
-        raise ConfigurationError(f"taps = {taps}; give 4 or more (40 suffice for the problem of T&B)")
+    if not 4 <= taps <= MOST_TAPS:
+        raise ConfigurationError(f"taps = {taps}; give 4 to {MOST_TAPS} (40 suffice for the problem of T&B)")
     begin = time.perf_counter()
     full = Channels(problem, taps, taps + _tail(problem))
     for slack in (BACK_OFF, 4 * BACK_OFF, 16 * BACK_OFF):

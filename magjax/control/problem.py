@@ -71,8 +71,10 @@ class TrackingProblem:
     def __post_init__(self):
         for name in ("r_bar", "w_bar", "u_bar", "T"):
             value = getattr(self, name)
-            if not value > 0:
-                raise ConfigurationError(f"{name} = {value}; give a positive value")
+            if not value > 0 or (name != "u_bar" and value == np.inf):
+                raise ConfigurationError(
+                    f"{name} = {value}; give a positive value{' (inf for no limit)' if name == 'u_bar' else ''}"
+                )
         if self.robust and np.any(np.abs(roots_of(self.weight[1])) <= 1):
             raise ConfigurationError("the weight W_0 is unstable (a pole with |lambda| <= 1); choose one with all poles outside")
 

@@ -8,6 +8,9 @@ from ..errors import ConfigurationError, RecordingError
 from .dynamic import KNOWN_INVERSES, SENSOR_INVERSES, PlainActuator, current_for_displacement, nearest_feasible, undo_sensor
 
 
+LONGEST_M = 5e-3  # no actuator of this kind moves further: the unit is wrong
+
+
 def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict:
     """Read time_s and displacement_m (or _um), write time_s and current_A; returns a summary.
 
@@ -18,7 +21,15 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
     time, wanted = read_trajectory(Path(trajectory))
     h = float(np.median(np.diff(time)))
     current, infeasible, saturated = current_for_displacement(plant, wanted, h, of_reading)
+    if infeasible.all():
+        stroke = 1e6 * plant.l_rod * plant.lambda_s
+        raise RecordingError(
+            f"{trajectory}: no sample can be reached ({1e6 * wanted.min():.4g} .. {1e6 * wanted.max():.4g} um are wanted, "
+            f"the actuator moves between 0 and {stroke:.4g} um); check unit and zero"
+        )
     out = Path(out)
+    if out.is_dir():
+        raise ConfigurationError(f"{out}: is a folder; give the name of a file in it")
     partial = out.with_name(out.name + ".part")
     try:
         columns, names = [time, current], "time_s,current_A"
@@ -69,7 +80,11 @@ def read_trajectory(path):
 
     if not path.exists():
         raise RecordingError(f"{path}: no such file; check the name")
-    table, _ = _read_csv(path)
+    try:
+        table, _ = _read_csv(path)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise RecordingError(f"{path}: cannot be read as CSV ({reason}); give a table with time_s and displacement_m") from None
     found = {}
     for name, values in table.items():
         quantity, unit = _parse(name)
@@ -80,10 +95,16 @@ def read_trajectory(path):
             raise RecordingError(f"{path}: no {quantity} column among {', '.join(table)}; name it {usual}")
     time, wanted = found["time"], found["displacement"]
     steps = np.diff(time)
-    if len(time) < 4 or not np.all(np.isfinite(wanted)):
-        raise RecordingError(f"{path}: needs at least four samples and no gaps in displacement; fill or cut them")
+    if len(time) < 4 or not np.all(np.isfinite(wanted)) or not np.all(np.isfinite(time)):
+        raise RecordingError(f"{path}: needs at least four samples and no gaps in time or displacement; fill or cut them")
+    if not np.median(steps) > 0:
+        raise RecordingError(f"{path}: time does not run forward (steps of {np.median(steps):.6g} s); sort the samples by time")
+    if np.abs(wanted).max() > LONGEST_M:
+        raise RecordingError(
+            f"{path}: displacements up to {np.abs(wanted).max():.4g} m; if the column is in um, name it displacement_um"
+        )
     uneven = np.abs(steps - np.median(steps)) > 1e-3 * abs(np.median(steps))
-    if uneven.any() or not np.median(steps) > 0:
+    if uneven.any():
         k = int(np.argmax(uneven))
         raise RecordingError(
             f"{path}: time is not uniform at sample {k + 1} (step {steps[k]:.6g} s, usually {np.median(steps):.6g}); resample it"

@@ -233,3 +233,9 @@ def test_bad_problems_are_told():
             TrackingProblem(**changed)
     with pytest.raises(ConfigurationError, match="positive"):
         rod(f0=-1)
+    for name in ("r_bar", "w_bar", "T", "u_bar"):
+        for value in (float("nan"), 0.0, -float("inf")) + (() if name == "u_bar" else (float("inf"),)):
+            with pytest.raises(ConfigurationError, match=name):
+                TrackingProblem(**{name: value})
+    with pytest.raises(ConfigurationError, match="give 4 to 1000"):
+        design(TrackingProblem(), taps=10**6)

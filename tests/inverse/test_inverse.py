@@ -202,3 +202,31 @@ def test_what_is_no_number_is_refused_and_the_memory_kept():
     if importlib.util.find_spec("numba"):
         with pytest.raises(ConfigurationError, match="at sample 1"):
             plain.invert([0.1, nan], accelerate=True)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("time_s,displacement_m\n" + "".join(f"{k}e-4,{30 + k}\n" for k in range(9)), "if the column is in um"),
+        ("time_s,displacement_um\n" + "".join(f"{k}e-4,-30\n" for k in range(9)), "no sample can be reached"),
+        ("time_s,displacement_um\n" + "".join(f"{9 - k}e-4,30\n" for k in range(9)), "does not run forward"),
+        ("time_s,displacement_um\n0,30\nnan,30\n2e-4,30\n3e-4,30\n", "no gaps in time"),
+        ("time_s,displacement_um\n0,30\n1e-4,nan\n2e-4,30\n3e-4,30\n", "no gaps in time or displacement"),
+        ("time_s,colour\n0,1\n1,2\n", "no displacement column"),
+        ("time_s,displacement_um\n", "no samples"),
+        ("", "no header row"),
+        (bytes(range(256)), "cannot be read as CSV"),
+        (None, "cannot be read as CSV"),
+    ],
+)
+def test_a_bad_trajectory_is_one_line_and_writes_nothing(tmp_path, capsys, content, words):
+    from magjax.cli import main
+
+    path = tmp_path / "w\u00e4nted.csv"
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert main(["invert", str(path), "--out", str(tmp_path / "current.csv")]) == 3
+    text = capsys.readouterr().err
+    assert words in text and text.count("\n") == 1 and [f.name for f in tmp_path.iterdir()] == [path.name]
