@@ -38,6 +38,13 @@ class Live:
             self.told = time.monotonic()
             self.console.print(row, highlight=False, soft_wrap=True)
 
+    def tell(self, text: str) -> None:
+        """What is being done between recordings."""
+        if self.live is not None:
+            from rich.spinner import Spinner
+
+            self.live.update(Spinner("dots", text=text))
+
     def _row(self, state):
         rate = 0.0
         if self.before and state["host_time"] > self.before["host_time"]:

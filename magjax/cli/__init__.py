@@ -55,9 +55,13 @@ def main(arguments=None) -> int:
         return 2
     from magjax.errors import MagjaxError
 
+    from .waiting import Waiting
+
+    calm = not {"-h", "--help", "--quiet"}.isdisjoint(arguments)
     try:
-        module = importlib.import_module(COMMANDS[arguments[0]][0])
-        return module.run(arguments[0], arguments[1:]) or 0
+        with Waiting(f"magjax {arguments[0]}", active=not calm):
+            module = importlib.import_module(COMMANDS[arguments[0]][0])
+            return module.run(arguments[0], arguments[1:]) or 0
     except MagjaxError as error:
         print(f"magjax {arguments[0]}: {error}", file=sys.stderr)
         return error.exit_status

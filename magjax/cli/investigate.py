@@ -32,7 +32,7 @@ def run(_command: str, arguments: list[str]) -> int:
         if plan is not None:
             made.settings = plan.settings
         state = Investigation(
-            made, analysis(made.bench, made.folder, options), Budget(options.recordings, options.minutes), plan
+            made, analysis(made.bench, made.folder, options, live), Budget(options.recordings, options.minutes), plan
         ).run()
     ended = state["ended"]
     if options.json:
@@ -43,10 +43,14 @@ def run(_command: str, arguments: list[str]) -> int:
     return STATUS.get(ended["how"], 3 if verdict == "data_problem" else 4)
 
 
-def analysis(bench, folder, options):
-    """Fit and diagnosis as the investigation calls them."""
+def analysis(bench, folder, options, live):
+    """Fit and diagnosis as the investigation calls them; `live` shows how far they are."""
+
+    def progress(text, step=0, chi2=None):
+        live.tell(f"{text}{f': step {step}' if step else ''}{'' if chi2 is None else f', chi2/N = {chi2:.4g}'}")
 
     def analyse(files, checks, number):
+        live.tell("reading and compiling")
         prepare_jax()
         from fitting.diagnose import Diagnosis, diagnose
         from fitting.report import write_diagnosis
@@ -59,7 +63,7 @@ def analysis(bench, folder, options):
         try:
             recordings = load_recordings(files, bench)
             held = load_recordings(checks, bench) if checks else []
-            found = diagnose(recordings, bench, check=held)
+            found = diagnose(recordings, bench, check=held, progress=progress)
         except RecordingError as error:
             found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
         content = found.as_dict()

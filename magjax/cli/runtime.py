@@ -3,10 +3,11 @@
 import argparse
 import os
 import sys
-import time
 from pathlib import Path
 
 from magjax.errors import ConfigurationError
+
+from .waiting import tell
 
 
 def prepare_jax() -> None:
@@ -57,28 +58,19 @@ def output_folder(path) -> Path | None:
 
 
 class Progress:
-    """Progress on stderr by rich: a spinner with what is being done, silent when asked."""
+    """What a long step reports, called as progress(text, step, chi2 per datum): the words of the command's spinner."""
 
     def __init__(self, quiet: bool):
         self.quiet = quiet
-        self.status = None
 
     def __enter__(self):
-        if not self.quiet:
-            from rich.console import Console
-
-            self.status = Console(stderr=True).status("reading and compiling")
-            self.status.start()
-            self.begin = time.perf_counter()
         return self
 
     def __exit__(self, *_):
-        if self.status is not None:
-            self.status.stop()
+        pass
 
     def __call__(self, text, step=0, chi2=None):
         """What is being done, at which step, with which misfit."""
-        if self.status is not None:
+        if not self.quiet:
             misfit = "" if chi2 is None else f", chi2/N = {chi2:.4g}"
-            at = f": step {step}" if step else ""
-            self.status.update(f"{text}{at}{misfit} ({time.perf_counter() - self.begin:.0f} s)")
+            tell(f"{text}{f': step {step}' if step else ''}{misfit}")

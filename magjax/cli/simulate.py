@@ -2,8 +2,6 @@
 
 import json
 
-import numpy as np
-
 from magjax.errors import ConfigurationError
 
 from .runtime import Progress, output_folder, parser, prepare_jax
@@ -52,6 +50,8 @@ def run_simulate(arguments) -> int:
     p.add_argument("--samples", type=int, default=1000, help="samples a period")
     p.add_argument("--out", default="simulation.nc", help="NetCDF file")
     options = p.parse_args(arguments)
+    import numpy as np
+
     prepare_jax()
     actuator, bench = _actuator(options)
     path = _target(options.out)
@@ -78,6 +78,8 @@ def run_simulate(arguments) -> int:
 
 
 def _values(text):
+    import numpy as np
+
     try:
         if ":" in text:
             low, high, count = text.split(":")
@@ -97,6 +99,8 @@ def run_sweep(arguments) -> int:
     p.add_argument("--out", default="sweep.nc", help="NetCDF file")
     add_where(p, "finished chunks")
     options = p.parse_args(arguments)
+    import numpy as np
+
     executor = executor_of(options)
     prepare_jax()
     actuator, _ = _actuator(options)
