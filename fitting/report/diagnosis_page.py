@@ -5,11 +5,11 @@ import math
 
 from . import found as pictures
 from . import loops, misfit, plane, tables
-from .fit_page import convergence_part, headed, sentence
+from .fit_page import convergence_part, headed, residual_section, sentence
 from .page import Sketch, part, section
-from .style import plain, scale_of
+from .style import percent, plain, scale_of, unit_text
 
-TONES = {"nothing_missing": "good", "attributed": "good", "group": "warn", "absorbed": "warn", "unknown_at": "warn", "data_problem": "bad"}
+TONES = {"nothing_missing": "good", "attributed": "info", "group": "warn", "absorbed": "warn", "unknown_at": "warn", "data_problem": "bad"}
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
 
@@ -17,9 +17,10 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     """The page's words, tables and pictures; `say(text)` before each picture."""
     sketch = Sketch(say)
     facts = json.loads(str(evidence["catalogue"])) if "catalogue" in evidence else {}
-    base, repaired = evidence.get("base", {}), evidence.get("repaired", {})
+    base, repaired = evidence.get("base", {}), evidence.get("repaired", {})  # none where the recordings themselves are shown
     fit = found["base"] or {}
     output = (fit.get("recordings") or [{"channel": "displacement"}])[0]["channel"]
+    broken = bool(fit) and not math.isfinite(fit["chi2_per_sample"] if fit["chi2_per_sample"] is not None else math.nan)
     drive = str(evidence.get("drive", "current"))
     sections = [
         _named(found, facts),
@@ -30,18 +31,24 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         _checks(found, evidence, sketch, output, drive),
         _where(found, base, sketch, output),
         _ranking(found, facts, sketch),
-        section("Before and after on the fitted recordings" if repaired else "Loops", sketch(base, loops.loops, base, output, drive, repaired or None)),
-        _left(base, repaired, sketch, output),
+        _loops(base, repaired, sketch, output, drive),
+        _left(found, base, repaired, sketch, output),
         _shifts(found),
-        placebo_section(found.get("placebo"), found["verdict"]),
+        placebo_section(found.get("placebo"), "data_problem" if broken else found["verdict"]),
         *_models(found, evidence, sketch, drive),
         section("Floors", part(table=_floors(found, output))),
     ]
     count = len(fit.get("recordings", []))
-    about = f"Bench {fit['bench']}; {count} recordings fitted, {len(found['check'])} check recordings." if fit else "No model could be fitted."
+    plural = lambda n, what: f"{n} {what}{'' if n == 1 else 's'}"
+    about = f"Bench {fit['bench']}; {plural(count, 'recording')}, {plural(len(found['check']), 'check recording')}." if fit else "No model could be fitted."
+    message = found["message"]
+    for name in sorted({c["name"] for c in found["candidates"]} | set(facts), key=len, reverse=True):
+        message = message.replace(name, words(name))
+    said = "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file." if broken else ""
     return {
-        "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": TONES.get(found["verdict"], "bad"),
-        "headline": headline(found), "message": [sentence(found["message"])], "sections": [s for s in sections if s],
+        "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else TONES.get(found["verdict"], "bad"),
+        "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
+        "message": [said or sentence(message)], "sections": [s for s in sections if s],
     }  # fmt: skip
 
 
@@ -74,7 +81,7 @@ def _named(found, facts):
         return None
     rows, laws = [], []
     for e in found["effects"]:
-        size = "; ".join(f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {p['unit']}".strip() for n, p in e["parameters"].items())
+        size = "; ".join(f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'] if p['unit'] != '1' else '')}".strip() for n, p in e["parameters"].items())
         rows.append([words(e["name"]), e["block"], size, plain(e["confidence"], 2)])
         about = facts.get(e["name"], {})
         if about.get("law"):
@@ -101,7 +108,7 @@ def _unknown(found):
     if not unknown:
         return None
     rows = [["block it acts most like", unknown.get("block", "")], ["region", unknown.get("region", "")]]
-    rows += [["share of the excess that the nearest effect explains", f"{plain(100 * unknown['explained_share'], 2)} %"]] if "explained_share" in unknown else []
+    rows += [["share of the excess that the nearest effect explains", percent(unknown["explained_share"])]] if "explained_share" in unknown else []
     return section("What is known of it", part(table=tables.table("The unknown", ["question", "answer"], rows)))
 
 
@@ -120,8 +127,17 @@ def _next(found):
 def _checks(found, evidence, sketch, output, drive):
     if not found["check"]:
         return None
-    drawn = sketch(evidence.get("checks"), loops.checks, evidence.get("checks"), output, drive, found["check"])
-    return section("Check recordings, before and after", part(table=tables.checks(found["check"])), drawn)
+    repaired = bool(found["repaired"])
+    drawn = sketch(evidence.get("checks"), loops.checks, evidence.get("checks"), output, drive, found["check"], repaired)
+    title = "Check recordings, before and after" if repaired else "Check recordings"
+    return section(title, part(table=tables.checks(found["check"], repaired)), drawn)
+
+
+def _loops(base, repaired, sketch, output, drive):
+    if not base or not base["chosen"].size:
+        return None
+    title = "Fitted recordings, before and after" if repaired else "Measured and fitted loops"
+    return section(title, sketch(base, loops.loops, base, output, drive, repaired or None))
 
 
 def _where(found, base, sketch, output):
@@ -144,17 +160,17 @@ def power(candidate, facts) -> str:
     if not typical or not visible or not math.isfinite(visible):
         return "–"
     z = SEEN_AT * typical / visible
-    return f"{plain(100 * 0.5 * (1 + math.erf((z - pictures.THRESHOLD) / math.sqrt(2))), 2)} %"
+    return percent(0.5 * (1 + math.erf((z - pictures.THRESHOLD) / math.sqrt(2))))
 
 
 def _ranking(found, facts, sketch):
-    ranked = found["candidates"]
+    ranked = sorted((c for c in found["candidates"] if math.isfinite(c["z"] if c["z"] is not None else math.nan)), key=lambda c: -abs(c["z"]))
     if not ranked:
         return None
     rows = []
     for c in ranked:
         unit = facts.get(c["name"], {}).get("unit", "")
-        unit = "" if unit == "1" else f" {unit}"
+        unit = "" if unit == "1" else f" {unit_text(unit)}"
         fell = plain(c["achieved_chi2_drop"]) if c["achieved_chi2_drop"] is not None else "not fitted"
         bic = plain(c["bic_change"]) if c["bic_change"] is not None else ""
         rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), f"{plain(c['amplitude'])}{unit}",
@@ -170,12 +186,17 @@ def _ranking(found, facts, sketch):
     return section("The catalogue against the misfit", drawn, part(table=tables.table("Every candidate, best first", head, rows, note)), part(text=text))
 
 
-def _left(base, repaired, sketch, output):
+def repair_words(found) -> str:
+    """What to call the model with the additions of the search."""
+    return {"unknown_at": "the nearest repair tried", "group": "the model with the leading rival"}.get(found["verdict"], "the repaired model")
+
+
+def _left(found, base, repaired, sketch, output):
     if not repaired:
-        return section("Spectrum of what is left", sketch(base, misfit.spectrum, base, output, "spectrum"))
+        return residual_section(sketch, base, output, "What the plain model leaves", with_map=False) if base else None
     return section(
-        "What the repaired model leaves",
-        *headed("By frequency and harmonic", sketch(repaired, misfit.misfit_map, repaired, "misfit-after", "Misfit of the repaired model over noise")),
+        f"What {repair_words(found)} leaves",
+        *headed("By frequency and harmonic", sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise")),
         *headed("Against field, rate and frequency", sketch(repaired, misfit.against, repaired, "against-after")),
         *headed("Autocorrelation", sketch(repaired, misfit.autocorrelation, repaired, "autocorrelation-after")),
         *headed("Spectrum", sketch(repaired, misfit.spectrum, repaired, output, "spectrum-after")),
@@ -189,13 +210,13 @@ def _shifts(found):
         for name, (before, now) in e["shifts"].items():
             error = after.get(name, {}).get("stderr", 0.0)
             apart = plain(abs(now - before) / error, 2) if error else "–"
-            share = f"{plain(100 * (before - now) / abs(now), 2)} %" if now else "–"
-            rows.append([name, words(e["name"]), tables.to_error(before, error), tables.to_error(now, error), after.get(name, {}).get("unit", ""), share, apart])
+            share = f"{100 * (before - now) / abs(now):+.2g} %".replace("-", "−") if now else "–"
+            rows.append([name, words(e["name"]), tables.to_error(before, error), tables.to_error(now, error), unit_text(after.get(name, {}).get("unit", "")), share, apart])
     if not rows:
         return None
     text = "To make up for what it lacked, the plain model had bent these constants; beside each, what it had got wrong."
     head = ["parameter", "when adding", "before", "after", "unit", "was wrong by", "in standard errors"]
-    return section("Parameter shifts", part(text=text, table=tables.table("Constants before and after the repair", head, rows)))
+    return section("Parameter shifts", part(text=text, table=tables.table("Constants before and after the repair", head, rows, code=True)))
 
 
 def placebo_section(placebo, verdict):
@@ -216,7 +237,7 @@ def placebo_section(placebo, verdict):
         low, high = interval(false, number)
         parts.append(
             part(text=f"In {number} searches on recordings simulated from the repaired model, {false} named something more, where nothing more was "
-                      f"({plain(100 * false / number, 2)} %; 95 % interval {plain(100 * low, 2)} to {plain(100 * high, 2)} %).")  # fmt: skip
+                      f"({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)}).")  # fmt: skip
         )
     rows = [[words(str(k)), _shown(v)] for k, v in placebo.items()]
     return section(title, *parts, part(table=tables.table("The placebo in numbers", ["quantity", "value"], rows)))
@@ -244,20 +265,21 @@ def _models(found, evidence, sketch, drive):
     if repaired:
         valid = repaired["converged"] and repaired["chi2_per_sample"] < 1.3
         yield section(
-            "The repaired model",
+            sentence(repair_words(found)).rstrip("."),
             part(text=sentence(repaired["message"])),
-            *(part(table=t) for t in tables.parameters(repaired, valid, "Parameters of the repaired model")),
+            *(part(table=t) for t in tables.parameters(repaired, valid, f"Parameters of {repair_words(found)}")),
             part(table=tables.correlations(repaired)),
             sketch(best, plane.mass_map, best),
             sketch(best.get("inside"), loops.inside, best, drive),
             convergence_part(sketch, repaired),
         )
     if base:
-        valid = base["converged"] and base["chi2_per_sample"] < 1.3
+        spoilt = found["verdict"] == "data_problem" or not math.isfinite(base["chi2_per_sample"])
+        valid = base["converged"] and base["chi2_per_sample"] < 1.3 and not spoilt
         yield section(
-            "The plain model",
-            part(text=sentence(base["message"])),
-            *(part(table=t) for t in tables.parameters(base, valid, "Parameters of the plain model")),
+            "A fit to them as they are (not to be used)" if spoilt else "The plain model",
+            part(text=sentence("" if spoilt else base["message"])),
+            *(part(table=t) for t in tables.parameters(base, valid, "Parameters of the plain model")[: 1 if repaired else 2]),
             part(table=tables.recordings(base)),
             *([] if repaired else [sketch(best, plane.mass_map, best), sketch(best.get("inside"), loops.inside, best, drive)]),
         )

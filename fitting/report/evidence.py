@@ -100,7 +100,7 @@ def _loop(s, misfit) -> dict:
     }  # fmt: skip
 
 
-def _zoom(s, misfit, width: float = 0.08) -> dict:
+def _zoom(s, misfit, width: float = 0.06) -> dict:
     """Raw samples about the largest misfit of the last period, s from the record's start."""
     phases = np.arange(1000) / 1000
     smooth = evaluate_lines(misfit, phases)
@@ -108,8 +108,8 @@ def _zoom(s, misfit, width: float = 0.08) -> dict:
     all_phases = _phases(s)
     near = np.flatnonzero(np.abs(all_phases - centre) < width)
     near = near[:: max(1, len(near) // 250)]
-    reading = evaluate_lines(s.reading, all_phases[near])
-    return {"time": near * s.dt, "measured": reading + s.residue[near], "model": reading + evaluate_lines(misfit, all_phases[near])}
+    reading, repeating = evaluate_lines(s.reading, all_phases[near]), evaluate_lines(misfit, all_phases[near])
+    return {"time": near * s.dt, "measured": reading + s.residue[near], "model": reading + repeating, "misfit": repeating}
 
 
 def _lines(result, misfit) -> dict:

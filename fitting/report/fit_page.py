@@ -1,9 +1,12 @@
 """The page of a fit: may it be trusted, what came out, how it meets each recording, what it leaves, what it holds inside."""
 
+import re
+
 from . import loops, misfit, plane, tables
 from .page import Sketch, part, section
 from .style import plain
 
+NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
 AT_NOISE, FAR = 1.1, 2.0  # chi2/N: below it the error bars hold; above it they mean nothing
 WORST_AT_NOISE = 1.6
 
@@ -17,7 +20,9 @@ def validity(fit) -> tuple[str, str, str, bool]:
     ask = "Run the diagnosis on the same files; it says what physics is missing, and where:"
     if not fit["converged"]:
         return "bad", "Not converged: these numbers are not a result", "Raise --max-jacobians, or start nearer with --model.", False
-    if chi2 > FAR or chi2 != chi2:
+    if chi2 is None or chi2 != chi2:
+        return "bad", "The misfit is not a number: these numbers are not a result", "Check the signs and units of the channels in the bench file.", False
+    if chi2 > FAR:
         return "bad", f"Error bars not valid: the residual is {plain(chi2**0.5, 2)} times the noise", ask, False
     if bound:
         return "bad", f"At a bound: {', '.join(bound)}", "A parameter at its bound takes the blame for something else; free another, or check the bench file.", False
@@ -37,7 +42,7 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
     number = len(fit["recordings"])
     span = sorted(r["frequency"] for r in fit["recordings"])
     sections = [
-        section("Parameters", *(part(table=t) for t in tables.parameters(fit, valid)), part(table=tables.correlations(fit))),
+        section("Parameters", *(part(table=t) for t in (*tables.parameters(fit, valid), *tables.intervals(fit))), part(table=tables.correlations(fit))),
         section("Recordings", part(table=tables.recordings(fit))),
         section(
             "Measured and fitted",
@@ -58,11 +63,11 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
     }  # fmt: skip
 
 
-def residual_section(sketch, evidence, output, title: str = "What the fit leaves"):
+def residual_section(sketch, evidence, output, title: str = "What the fit leaves", with_map: bool = True):
     """Map, traces, branches, autocorrelation and spectrum of the residual."""
     return section(
         title,
-        *headed("By frequency and harmonic", sketch(evidence, misfit.misfit_map, evidence)),
+        *headed("By frequency and harmonic", sketch(evidence if with_map else None, misfit.misfit_map, evidence)),
         *headed("Along time", sketch(evidence, misfit.traces, evidence)),
         *headed("Against field, rate and frequency", sketch(evidence, misfit.against, evidence)),
         *headed("Autocorrelation", sketch(evidence, misfit.autocorrelation, evidence)),
@@ -82,9 +87,13 @@ def convergence_part(sketch, fit):
 
 
 def sentence(text: str) -> str:
-    """A message with a capital and a full stop."""
-    text = text.strip()
-    return (text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".")) if text else ""
+    """A message with a capital (unless it begins with a name) and a full stop, its signs as people write them."""
+    text = text.strip().replace(" -> ", " → ").replace("chi2/N", "χ²/N").replace("= nan", "= not a number")
+    if not text:
+        return ""
+    text = NANOMETRES.sub(lambda m: " → ".join(f"{1e9 * float(v):.3g}" for v in m.groups() if v) + " nm", text)
+    first = text.split()[0].rstrip(",:;.")
+    return (text[0].upper() + text[1:] if first.isalpha() else text) + ("" if text.endswith((".", "?", "!")) else ".")
 
 
 def _quantities(fit, evidence):

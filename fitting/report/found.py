@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .style import BLUE, INK, MUTED, ORANGE, PALE, SKY, VERMILION, canvas, picture, plain, scale_of, styled
+from .style import BLUE, INK, MUTED, PALE, SKY, VERMILION, canvas, percent, picture, plain, scale_of, styled
 
 WIDTH = 10.0
 BLOCKS = ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sensor")
@@ -27,7 +27,7 @@ def block_map(where, found_in, output: str, stem: str = "blocks"):
             named = block in found_in
             axes.add_patch(_box(left, wide - 0.03, tint, 2.4 if named else 0.8))
             axes.text(left + 0.5 * (wide - 0.03), 0.70, block, ha="center", va="center", fontweight="bold" if named else "normal")
-            axes.text(left + 0.5 * (wide - 0.03), 0.47, f"{plain(100 * share, 2)} %", ha="center", va="center", fontsize=11)
+            axes.text(left + 0.5 * (wide - 0.03), 0.47, percent(share), ha="center", va="center", fontsize=11)
             axes.text(left + 0.5 * (wide - 0.03), 0.25, "effect named here" if named else "", ha="center", va="center", fontsize=7.5)
             if k + 1 < len(shown):
                 axes.annotate("", xy=(left + wide - 0.006, 0.5), xytext=(left + wide - 0.03, 0.5), arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1})
@@ -36,7 +36,7 @@ def block_map(where, found_in, output: str, stem: str = "blocks"):
             f"The chain from {ends} to reading. The percentage is the share of the misfit that the best single effect of the block could take, to first "
             "order; blocks overlap, so shares do not add up. A thick frame marks the block of what was named."
         )
-        words = ", ".join(f"{b} {plain(100 * shares.get(b, 0.0), 2)} %" for b in shown)
+        words = ", ".join(f"{b} {percent(shares.get(b, 0.0))}" for b in shown)
         return picture(figure, stem, "Block map: what each block could explain", caption, words)
 
 
@@ -59,15 +59,15 @@ def places(where, evidence, output: str, stem: str = "places"):
         )
         highest = 1.15 * max(noise, *(fine * max(v) for _, _, v in groups))
         for k, (title, names, values) in enumerate(groups):
-            axes = figure.add_axes([0.07 + 0.33 * k, 0.2, 0.25, 0.66])
-            axes.bar(range(len(values)), fine * np.asarray(values), color=[SKY, ORANGE, PALE][: len(values)] if k == 0 else SKY, ec=INK, lw=0.5, width=0.65)
+            axes = figure.add_axes([0.07 + 0.33 * k, 0.2, 0.24, 0.7])
+            axes.bar(range(len(values)), fine * np.asarray(values), color=SKY, ec=INK, lw=0.5, width=0.65)
             axes.axhline(noise, color=INK, lw=1, ls=(0, (4, 2)))
-            axes.text(len(values) - 0.5, noise, "noise", ha="right", va="bottom", fontsize=7.5)
+            axes.text(1.0, noise / highest, " noise", transform=axes.transAxes, ha="left", va="center", fontsize=7.5)
             axes.set_xticks(range(len(values)), names)
             axes.set(title=title, ylim=(0, highest))
             if k == 0:
                 axes.set_ylabel(f"misfit, rms / {unit}")
-        axes = figure.add_axes([0.73, 0.2, 0.25, 0.66])
+        axes = figure.add_axes([0.74, 0.2, 0.24, 0.7])
         rows = where["by_period"]
         for k, row in enumerate(rows):
             axes.plot(np.arange(1, len(row) + 1), fine * np.asarray(row), marker="o", ms=2.5, lw=0.8, color=BLUE, alpha=0.7)
@@ -86,32 +86,29 @@ def places(where, evidence, output: str, stem: str = "places"):
 def ranking(candidates, stem: str = "ranking", count: int = 16):
     """|z| of the leading candidates; dark where fitted for real."""
     rows = candidates[:count][::-1]
-    scores = np.array([abs(c["z"]) for c in rows])
+    scores = np.nan_to_num(np.array([abs(c["z"]) for c in rows]))
     height = 0.75 + 0.23 * len(rows)
-    log = scores.max() > 60
     with styled():
         figure = canvas(WIDTH, height)
         axes = figure.add_axes([0.235, 0.45 / height, 0.62, 1 - 0.55 / height])
         fitted = [c["achieved_chi2_drop"] is not None for c in rows]
-        base = 0.5 if log else 0.0
-        axes.barh(range(len(rows)), np.maximum(scores, base) - base, left=base, color=[BLUE if f else PALE for f in fitted], ec=INK, lw=0.4, height=0.7)
+        axes.barh(range(len(rows)), scores, color=[BLUE if f else PALE for f in fitted], ec=INK, lw=0.4, height=0.7)
         axes.axvline(THRESHOLD, color=VERMILION, lw=1.2, ls=(0, (4, 2)))
-        if log:
-            axes.set_xscale("log")
-            axes.set_xlim(base, scores.max() * 1.1)
+        reach = max(1.05 * float(scores.max()), 1.5 * THRESHOLD)
+        axes.set_xscale("function", functions=(lambda x: np.sqrt(np.maximum(x, 0)), np.square))
+        ticks = [t for t in (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000) if t <= reach]
+        ticks = [t for t in ticks if t == 0 or t > 0.004 * reach]
+        axes.set_xlim(0, reach)
+        axes.set_xticks(ticks, [str(t) for t in ticks])
         for k, c in enumerate(rows):
             if c["achieved_chi2_drop"] is not None:
                 axes.text(1.01, k, f"χ² fell by {plain(c['achieved_chi2_drop'])}", transform=axes.get_yaxis_transform(), va="center", fontsize=7.5)
         axes.set_yticks(range(len(rows)), [c["name"].replace("_", " ") for c in rows])
         axes.set_ylim(-0.6, len(rows) - 0.4)
         axes.set_xlabel("score |z|, standard deviations")
-        if log:
-            from .misfit import plain_ticks
-
-            plain_ticks(axes, "x")
         caption = (
-            "Score of each effect on what the plain model leaves, off everything that the plain model can do itself. Dashed: the threshold of "
-            f"{THRESHOLD}. Dark: fitted for real, with the fall of χ² that it achieved."
+            "Score of each effect on what the plain model leaves, off everything that the plain model can do itself (root scale). Dashed: the "
+            f"threshold of {THRESHOLD}. Dark: fitted for real, with the fall of χ² that it achieved."
         )
         lead = "; ".join(f"{c['name']} {plain(abs(c['z']))}" for c in candidates[:5])
         return picture(figure, stem, "Ranking of the catalogue", caption, f"Leaders: {lead}.")

@@ -7,6 +7,7 @@ from .style import BLUE, INK, MEASURED, MODEL, MUTED, PALE, SKY, VERMILION, canv
 COLUMNS = 3
 WIDTH = 10.0  # inches
 SHOWN = 12  # check recordings
+LEGEND = 0.25  # inches
 
 
 def loops(evidence, output: str, drive: str, after=None, stem: str = "loops"):
@@ -36,21 +37,26 @@ def loops(evidence, output: str, drive: str, after=None, stem: str = "loops"):
     return _panels(panels, output, drive, stem, title, caption, detail)
 
 
-def checks(entries, output: str, drive: str, rows, stem: str = "checks"):
-    """Check recordings: measured, predicted before and after."""
+def checks(entries, output: str, drive: str, rows, repaired: bool = True, stem: str = "checks"):
+    """Check recordings: measured, predicted before and after, or by the one model that there is."""
     panels = []
     for key, entry in list(entries.items())[:SHOWN]:
         row = rows[int(key)]
         loop = {**entry, "model": entry["before"]}
-        strips = [("model", "before", entry["before"] - entry["measured"]), ("after", "after", entry["after"] - entry["measured"])]
+        strips = [("model", "before", entry["before"] - entry["measured"])]
+        if repaired:
+            strips.append(("after", "after", entry["after"] - entry["measured"]))
+        else:
+            loop.pop("after")
         factor, unit = scale_of(output)[2:]
-        size = " → ".join(plain(factor * row[k]) for k in ("rms_before", "rms_after"))
+        size = " → ".join(plain(factor * row[k]) for k in (("rms_before", "rms_after") if repaired else ("rms_after",)))
         panels.append((f"{entry['name']}\nrms {size} {unit}, noise {plain(factor * row['noise_rms'])}", loop, strips))
+    when = " before and after the repair" if repaired else ""
     caption = (
-        "Recordings that took no part in any fit: the reading and its prediction before and after the repair, and below them prediction "
-        "less measurement with twice the noise of the mean as the band."
+        f"Recordings that took no part in any fit: the reading and its prediction{when}, and below them prediction less measurement with twice "
+        "the noise of the mean as the band."
     )
-    return _panels(panels, output, drive, stem, "Check recordings before and after", caption, "")
+    return _panels(panels, output, drive, stem, f"Check recordings{when}", caption, "")
 
 
 def _panels(panels, output, drive, stem, title, caption, detail):
@@ -58,15 +64,16 @@ def _panels(panels, output, drive, stem, title, caption, detail):
     drive_factor, drive_name = drive_label(drive)
     columns = min(COLUMNS, max(len(panels), 1))
     rows = int(np.ceil(len(panels) / columns))
-    height = 4.0
+    height = 4.05  # of a loop with its strip
     with styled():
-        figure = canvas(WIDTH * columns / COLUMNS + (0.5 if columns < COLUMNS else 0), rows * height)
+        total = rows * height + LEGEND
+        figure = canvas(WIDTH * max(columns, 2) / COLUMNS if columns < COLUMNS else WIDTH, total)
         for k, (heading, loop, strips) in enumerate(panels):
             row, column = divmod(k, columns)
-            left, wide = (column + 0.19) / columns, 0.76 / columns
-            top = 1 - row / rows
-            upper = figure.add_axes([left, top - 0.60 / rows, wide, 0.49 / rows])
-            lower = figure.add_axes([left, top - 0.90 / rows, wide, 0.17 / rows])
+            left, wide = (column + 0.19) / max(columns, 2), 0.76 / max(columns, 2)
+            top = total - LEGEND - row * height
+            upper = figure.add_axes([left, (top - 2.40) / total, wide, 2.0 / total])
+            lower = figure.add_axes([left, (top - 3.62) / total, wide, 0.7 / total])
             _loop(upper, loop, drive_factor, factor, heading)
             _strip(lower, loop, strips, fine)
             upper.set_xlabel(drive_name)
@@ -75,7 +82,8 @@ def _panels(panels, output, drive, stem, title, caption, detail):
                 upper.set_ylabel(label)
                 lower.set_ylabel(f"residual / {unit}")
             if k == 0:
-                upper.legend(loc="upper left")
+                lines, names = upper.get_legend_handles_labels()
+                figure.legend(lines, names, loc="upper left", bbox_to_anchor=(left, 1), ncols=3, borderaxespad=0, handlelength=2.5)
         return picture(figure, stem, title, caption, detail)
 
 
@@ -104,32 +112,39 @@ def _strip(axes, loop, strips, fine):
 
 
 def zoom(evidence, output: str, stem: str = "zoom"):
-    """Raw samples and the model about the largest misfit of two recordings."""
-    factor, label = scale_of(output)[:2]
+    """Raw samples and the model about the largest misfit of two recordings, the difference below."""
+    factor, label, fine, unit = scale_of(output)
     keys = list(evidence["zoom"])
     with styled():
-        figure = canvas(WIDTH, 2.9)
+        figure = canvas(WIDTH, 3.9)
         for i, key in enumerate(keys):
-            axes = figure.add_axes([0.07 + i / 2, 0.17, 0.41 if len(keys) > 1 else 0.9, 0.68])
-            part = evidence["zoom"][key]
-            axes.plot(1e3 * part["time"], factor * part["measured"], ls="", marker=".", ms=3.4, mew=0, color=MEASURED, label="samples")
-            axes.plot(1e3 * part["time"], factor * part["model"], color=MODEL, lw=1.2, label="fitted")
-            k = int(key)
+            wide = 0.41 if len(keys) > 1 else 0.9
+            axes, below = (figure.add_axes([0.07 + i / 2, y, wide, h]) for y, h in ((0.42, 0.49), (0.12, 0.2)))
+            part, k = evidence["zoom"][key], int(key)
+            time = 1e3 * part["time"]
+            axes.plot(time, factor * part["measured"], ls="", marker=".", ms=3.4, mew=0, color=MEASURED, label="samples")
+            axes.plot(time, factor * part["model"], color=MODEL, lw=1.2, label="fitted")
             axes.set_title(f"{evidence['name'][k]}, {plain(evidence['frequency'][k])} Hz", loc="left")
-            axes.set_xlabel("time / ms")
+            band = 2 * fine * float(evidence["noise"][k])
+            below.axhspan(-band, band, color=PALE, lw=0)
+            below.axhline(0, color=MUTED, lw=0.5)
+            below.plot(time, fine * (part["model"] - part["measured"]), ls="", marker=".", ms=3, mew=0, color=MEASURED)
+            below.plot(time, fine * part["misfit"], color=MODEL, lw=1.2)
+            below.set_xlabel("time / ms")
             if i == 0:
                 axes.set_ylabel(label)
+                below.set_ylabel(f"residual / {unit}")
                 axes.legend()
-            _pad(axes)
-        caption = "Samples as recorded and the model, about the moment of the largest misfit: the worst recording" + (
-            " and the fastest." if len(keys) > 1 else "."
+            for ax in (axes, below):
+                ax.margins(0.03, 0.08)
+            axes.locator_params(axis="y", nbins=5)
+            below.locator_params(axis="y", nbins=3)
+        which = "the worst recording and the fastest" if len(keys) > 1 else "the worst recording"
+        caption = (
+            f"Samples as recorded and the model about the moment of the largest misfit, {which}. Below: model less samples, the part that "
+            "repeats every period as a line, and twice the noise of a sample as the band."
         )
         return picture(figure, stem, "Time zoom at the largest misfit", caption)
-
-
-def _pad(axes):
-    axes.margins(0.03, 0.08)
-    axes.locator_params(axis="y", nbins=5)
 
 
 def inside(evidence, drive: str, stem: str = "inside"):
@@ -139,7 +154,7 @@ def inside(evidence, drive: str, stem: str = "inside"):
     rows = ["H", "I_1", "M", "loop"] if with_current else ["H", "M", "loop"]
     heights = {"H": 1.25, "I_1": 1.25, "M": 1.25, "loop": 2.2}
     gap, top, bottom = 0.42, 0.32, 0.3
-    total = sum(heights[r] for r in rows) + gap * (len(rows) - 1) + top + bottom + 0.1
+    total = sum(heights[r] for r in rows) + gap * (len(rows) - 1) + top + bottom + 0.25
     with styled():
         figure = canvas(WIDTH, total)
         for c, key in enumerate(keys):
@@ -150,7 +165,7 @@ def inside(evidence, drive: str, stem: str = "inside"):
                 _inside_row(axes, row, signals, drive, c == 0)
                 if row == "H":
                     axes.set_title(f"{evidence['name'][int(key)]}, {plain(evidence['frequency'][int(key)])} Hz", loc="left")
-                y -= gap
+                y -= gap if row != "M" else 0.55
         words = "the current I that is applied and I₁ = (H − H_bias)/c₀, which is left of it for the field; " if with_current else ""
         caption = (
             f"Signals that no instrument reads, as the fitted model has them: the field that is applied and the field H in the rod; {words}"
@@ -193,11 +208,11 @@ def _inside_row(axes, row, signals, drive, first):
 def periods(entries, output: str, stem: str = "periods"):
     """The readings as recorded: the first and the last periods over each other."""
     factor, label = scale_of(output)[:2]
-    columns = min(COLUMNS, len(entries))
+    columns = max(2, min(COLUMNS, len(entries)))
     rows = int(np.ceil(len(entries) / columns))
     colours = [VERMILION, BLUE, INK]
     with styled():
-        figure = canvas(WIDTH * max(columns, 2) / COLUMNS, 2.6 * rows)
+        figure = canvas(WIDTH * columns / COLUMNS, 2.6 * rows)
         for k, entry in enumerate(entries.values()):
             row, column = divmod(k, columns)
             axes = figure.add_axes([(column + 0.19) / columns, 1 - (row + 0.80) / rows, 0.76 / columns, 0.62 / rows])

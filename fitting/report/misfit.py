@@ -19,14 +19,14 @@ def misfit_map(evidence, stem: str = "misfit", title: str = "Misfit over noise b
     worst = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(ratio), ratio, 0))), ratio.shape)
     with styled():
         figure = canvas(WIDTH, height)
-        axes = figure.add_axes([0.16, 0.62 / height, 0.70, 1 - 0.75 / height])
+        axes = figure.add_axes([0.16, 0.62 / height, 0.70, 1 - 0.67 / height])
         top = max(1.0, float(shown.max()))
         drawn = axes.imshow(shown, aspect="auto", cmap=SEQUENTIAL, vmin=np.log10(0.3), vmax=top, interpolation="nearest")
         step = max(1, R // 24)
         labels = [f"{plain(evidence['frequency'][k], 4)} Hz" for k in order]
         axes.set_yticks(range(0, R, step), labels[::step])
         axes.set_xlabel("harmonic of the drive (0: mean)")
-        bar = figure.colorbar(drawn, cax=figure.add_axes([0.875, 0.62 / height, 0.012, 1 - 0.75 / height]))
+        bar = figure.colorbar(drawn, cax=figure.add_axes([0.875, 0.62 / height, 0.012, 1 - 0.67 / height]))
         ticks = [t for t in (-0.5, 0, 0.5, 1, 1.5, 2, 2.5, 3, 4) if np.log10(0.3) <= t <= top]
         bar.set_ticks(ticks, labels=[plain(10.0**t, 2) for t in ticks])
         bar.set_label("misfit / noise of the line")
@@ -51,7 +51,9 @@ def traces(evidence, stem: str = "traces"):
         axes.set_yticks([-r * spacing for r in range(len(chosen))], [f"{plain(evidence['frequency'][k], 4)} Hz" for k in chosen])
         axes.set_xlabel("time / periods of the drive")
         axes.set_xlim(0, max(evidence["trace"][str(k)]["periods"][-1] for k in chosen))
-        axes.set_ylim(-(len(chosen) - 0.4) * spacing, 0.6 * spacing)
+        top = max(0.6 * spacing, max(float(v.max()) - r * spacing for r, v in enumerate(values)) + 1)
+        bottom = min(-(len(chosen) - 0.4) * spacing, min(float(v.min()) - r * spacing for r, v in enumerate(values)) - 1)
+        axes.set_ylim(bottom, top)
         worst = max(float(np.abs(v).max()) for v in values)
         caption = (
             "Residual along each record in units of its noise (means of short blocks); the bands are ± 2, where nineteen of twenty blocks "
@@ -63,8 +65,8 @@ def traces(evidence, stem: str = "traces"):
 def against(evidence, stem: str = "against"):
     """The residual against field and rate, by branch, and chi2/N against frequency."""
     with styled():
-        figure = canvas(WIDTH, 3.1)
-        axes = [figure.add_axes([0.065 + k / 3, 0.17, 0.255, 0.68]) for k in range(3)]
+        figure = canvas(WIDTH, 2.9)
+        axes = [figure.add_axes([0.065 + k / 3, 0.18, 0.255, 0.72]) for k in range(3)]
         for ax, key in zip(axes, ("field", "rate"), strict=False):
             _branches(ax, evidence["against"][key], key)
         axes[0].legend(loc="best", handlelength=1.6)
@@ -122,7 +124,7 @@ def autocorrelation(evidence, stem: str = "autocorrelation"):
     outside = float(np.mean(np.abs(found["residual"]) > band))
     with styled():
         figure = canvas(WIDTH, 2.5)
-        axes = figure.add_axes([0.08, 0.2, 0.88, 0.72])
+        axes = figure.add_axes([0.08, 0.2, 0.88, 0.77])
         axes.axhspan(-band, band, color=PALE, lw=0)
         axes.axhline(0, color=MUTED, lw=0.5)
         axes.plot(found["lag"], found["noise"], color=MUTED, lw=0.9, ls=(0, (3, 2)), label="between the harmonics (noise alone)")
@@ -148,7 +150,7 @@ def spectrum(evidence, output: str, stem: str = "spectrum"):
         highest = fine * 3 * float(np.nanmax(lines["measured"][:, 1:]))
         for i, key in enumerate(keys):
             k = int(key)
-            axes = figure.add_axes([0.07 + i * 0.315, 0.17, 0.285, 0.70])
+            axes = figure.add_axes([0.07 + i * 0.315, 0.17, 0.285, 0.75])
             order = np.arange(lines["floor"].shape[1])
             between = lines["between"][key]
             axes.plot(between["order"], fine * between["amplitude"], color=PALE, lw=1.0, label="between harmonics")
@@ -173,7 +175,7 @@ def convergence(history, stem: str = "convergence"):
     colours = [BLUE, VERMILION, GREEN, ORANGE, SKY, INK]
     with styled():
         figure = canvas(WIDTH, 2.5)
-        axes = figure.add_axes([0.08, 0.2, 0.88, 0.72])
+        axes = figure.add_axes([0.08, 0.2, 0.88, 0.77])
         begin = 0
         for k, (name, values) in enumerate(stages):
             at = begin + np.arange(1, len(values) + 1)

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.colors import PowerNorm
 
-from .style import INK, MUTED, SEQUENTIAL, canvas, picture, plain, styled
+from .style import INK, MUTED, SEQUENTIAL, canvas, percent, picture, styled
 
 
 def mass_map(evidence, stem: str = "masses"):
@@ -27,13 +27,13 @@ def mass_map(evidence, stem: str = "masses"):
             f"Masses of the relays over their thresholds, at level {len(masses)}, and the standard error of each; colours go with the square root. "
             + (
                 f"Hatched: the {blind} cells that no recording switches; their masses rest on the smoothness that is assumed alone. "
-                f"{plain(100 * share)} % of the mass is switched."
+                f"{percent(share)} of the mass is switched."
                 if blind
                 else "Every cell is switched by some recording; one that none switches would be hatched."
             )
         )
         if known:
-            caption += f" Of the switched mass {plain(100 * well)} % is in cells whose standard error is below 30 %."
+            caption += f" Of the switched mass {percent(well)} is in cells whose standard error is below 30 %."
         return picture(figure, stem, "Preisach masses and their standard errors", caption)
 
 

@@ -60,8 +60,11 @@ def plain(value: float, digits: int = 3) -> str:
         return "0"
     if 1e-3 <= abs(value) < 1e5:
         text = f"{value:.{digits}g}"
-        return f"{float(text):.0f}" if "e" in text else text.replace("-", "−")
+        return (f"{float(text):.0f}" if "e" in text else text).replace("-", "−")
+    if abs(value) == float("inf"):
+        return "∞"
     mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
+    mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
     return f"{mantissa}e{int(exponent)}".replace("-", "−")
 
 
@@ -80,6 +83,18 @@ def picture(figure: Figure, stem: str, title: str, caption: str, description: st
     return Picture(stem, title, caption, to_svg(figure, stem, title, f"{caption} {description}".strip()))
 
 
+def percent(share: float) -> str:
+    """A share in whole per cent, "< 1 %" and "> 99 %" at the ends."""
+    if share != share:
+        return "–"
+    return "0 %" if share <= 0 else "< 1 %" if share < 0.01 else "> 99 %" if 0.99 < share < 1 else f"{100 * share:.0f} %"
+
+
+def unit_text(unit: str) -> str:
+    """A unit with raised exponents."""
+    return unit.replace("^0.5", "^½").replace("^2", "²").replace("^3", "³").replace("^-1", "⁻¹")
+
+
 def to_svg(figure: Figure, stem: str, title: str, description: str) -> str:
     """The figure as inline SVG with role, name and description; ids begin with `stem`."""
     buffer = io.StringIO()
@@ -88,14 +103,44 @@ def to_svg(figure: Figure, stem: str, title: str, description: str) -> str:
     svg = svg[svg.index("<svg") :].rstrip()
     svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.S)
     svg = re.sub(r"<!--.*?-->\s*", "", svg, flags=re.S)
-    svg = re.sub(r' (?:d|x|y|points)="[^"]*"', lambda m: re.sub(r"(\d\.\d\d)\d+", r"\1", m[0]), svg)
+    svg = re.sub(r' d="([^"]*)"', lambda m: f' d="{short_path(m[1])}"', svg)
+    svg = re.sub(r' (?:x|y)="[^"]*"', lambda m: re.sub(r"(\d\.\d\d)\d+", r"\1", m[0]), svg)
     svg = re.sub(r'\bid="', f'id="{stem}-', svg)
     svg = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{stem}-", svg)
-    svg = svg.replace("'DejaVu Sans'", FONT).replace(", 'Bitstream Vera Sans', 'Computer Modern Sans Serif', 'Lucida Grande'", "")
-    svg = re.sub(r"\n\s*", "\n", svg)
+    svg = _without_ballast(re.sub(r"\n\s*", "\n", svg))
     head, body = svg.split(">", 1)
     head += f' role="img" aria-label="{_escape(title)}" aria-describedby="{stem}-desc"'
     return f'{head}>\n<title>{_escape(title)}</title>\n<desc id="{stem}-desc">{_escape(description)}</desc>{body}'
+
+
+def _without_ballast(svg: str) -> str:
+    """What matplotlib repeats for every text and every mark, said once or not at all."""
+    svg = re.sub(r" ?font-family: [^;\"]*;?", "", svg).replace("<svg ", f'<svg font-family="{FONT}" ', 1)
+    svg = re.sub(r' transform="rotate\(-0 [^"]*\)"', "", svg)
+    svg = re.sub(r"(rotate\([^)]*\))", lambda m: re.sub(r"(\d\.\d\d)\d+", r"\1", m[0]), svg)
+    used = set(re.findall(r"#([\w.-]+)[\")]", svg))
+    svg = re.sub(r' id="([^"]*)"', lambda m: m[0] if m[1] in used else "", svg)
+    for _ in range(3):
+        svg = re.sub(r"<g>\n(<(?:use|path) [^>]*/>|<text [^>]*>[^<]*</text>)\n</g>", r"\1", svg)
+    return svg
+
+
+def short_path(path: str) -> str:
+    """The same path in fewer bytes: polylines in relative steps of 0.05 point without drift, curves to 0.01 point."""
+    if set(re.findall("[A-Za-z]", path)) - set("MLz"):
+        return re.sub(r"(\d\.\d\d)\d+", r"\1", " ".join(path.split()))
+    made, at = [], (0, 0)
+    for command, x, y in re.findall(r"([ML]) ([-\d.]+) ([-\d.]+)|z", path):
+        if not command:
+            made.append("z")
+            continue
+        point = round(20 * float(x)), round(20 * float(y))
+        step = point if command == "M" else (point[0] - at[0], point[1] - at[1])
+        if command == "M" or step != (0, 0):
+            made.append(command.lower() if command == "L" else "M")
+            made.append(" ".join(f"{v / 20:.4g}" if abs(v) < 2000 else f"{v / 20:.2f}" for v in step))
+        at = point
+    return "".join(made)
 
 
 def _escape(text: str) -> str:

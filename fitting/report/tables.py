@@ -3,14 +3,14 @@
 import math
 from pathlib import Path
 
-from .style import plain, scale_of
+from .style import plain, scale_of, unit_text
 
 CHANNEL_OF = {"m": "displacement", "T": "flux_density", "A/m": "magnetization"}
 
 
-def table(caption, head, rows, note: str = "") -> dict:
-    """A table for the template: the first cell of each row is its header."""
-    return {"caption": caption, "head": list(head), "rows": [[str(c) for c in row] for row in rows], "note": note}
+def table(caption, head, rows, note: str = "", code: bool = False) -> dict:
+    """A table for the template: the first cell of each row is its header, set as code where it is a name to type."""
+    return {"caption": caption, "head": list(head), "rows": [[str(c) for c in row] for row in rows], "note": note, "code": code}
 
 
 def to_error(value: float, error: float) -> str:
@@ -32,19 +32,19 @@ def parameters(fit, valid: bool, caption: str = "Fitted parameters") -> list[dic
     free, fixed = [], []
     for name, p in fit["parameters"].items():
         if not p["free"]:
-            fixed.append([name, p.get("meaning", ""), plain(p["value"], 6), p["unit"]])
+            fixed.append([name, p.get("meaning", ""), plain(p["value"], 6), unit_text(p["unit"])])
             continue
         spread = 1.96 * p["stderr"]
         interval = f"{to_error(p['value'] - spread, p['stderr'])} to {to_error(p['value'] + spread, p['stderr'])}"
-        row = [name, p.get("meaning", ""), plain(p.get("start"), 5), to_error(p["value"], p["stderr"]), plain(p["stderr"], 2), interval, p["unit"], flags(p)]
+        row = [name, p.get("meaning", ""), plain(p.get("start"), 5), to_error(p["value"], p["stderr"]), plain(p["stderr"], 2), interval, unit_text(p["unit"]), flags(p)]
         free.append(row)
     error, interval = ("std. error", "95 % interval") if valid else ("std. error (not valid)", "95 % interval (not valid)")
     note = "" if valid else "Standard errors assume that only noise is left. It is not, so the true errors are larger by an unknown amount."
     tables = []
     if free:
-        tables.append(table(caption, ["parameter", "meaning", "start", "value", error, interval, "unit", "flags"], free, note))
+        tables.append(table(caption, ["parameter", "meaning", "start", "value", error, interval, "unit", "flags"], free, note, code=True))
     if fixed:
-        tables.append(table("Held at the bench file's values", ["parameter", "meaning", "value", "unit"], fixed))
+        tables.append(table("Held at the bench file's values", ["parameter", "meaning", "value", "unit"], fixed, code=True))
     return tables
 
 
@@ -63,7 +63,7 @@ def correlations(fit) -> dict | None:
             row.append("" if value is None else f"{value:.2f}".replace("-", "−") + (" strong" if strong else ""))
         rows.append(row)
     note = "“strong” marks pairs beyond 0.9: their values move together, and neither is known as well alone." if any("strong" in c for r in rows for c in r) else ""
-    return table("Correlations of the fitted constants", ["", *names], rows, note)
+    return table("Correlations of the fitted constants", ["", *names], rows, note, code=True)
 
 
 def recordings(fit) -> dict:
@@ -73,7 +73,7 @@ def recordings(fit) -> dict:
         fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
         rows.append([Path(r["file"]).name, plain(r["frequency"], 4), r["periods"], f"{plain(fine * r['noise_rms'])} {unit}",
                      f"{plain(fine * r['residual_rms'])} {unit}", plain(r["chi2_per_sample"]), r["sha256"][:12]])  # fmt: skip
-    return table("Recordings", ["recording", "frequency / Hz", "periods", "noise rms", "residual rms", "χ²/N", "sha256 begins"], rows)
+    return table("Noise and misfit of each recording", ["recording", "frequency / Hz", "periods", "noise rms", "residual rms", "χ²/N", "sha256 begins"], rows, code=True)
 
 
 def checks(rows, repaired: bool = True) -> dict:
@@ -81,10 +81,30 @@ def checks(rows, repaired: bool = True) -> dict:
     body = []
     for r in rows:
         fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
-        shown = [plain(fine * r["rms_before"]), plain(fine * r["rms_after"])] if repaired else [plain(fine * r["rms_after"])]
-        body.append([Path(r["file"]).name, *shown, plain(fine * r["noise_rms"]), unit])
-    head = ["recording", "rms error before", "rms error after", "noise rms", "unit"] if repaired else ["recording", "rms error", "noise rms", "unit"]
-    return table("Check recordings", head, body)
+        keys = ("rms_before", "rms_after") if repaired else ("rms_after",)
+        beyond = [(max(r[k] ** 2 - r["noise_rms"] ** 2, 0.0)) ** 0.5 for k in keys]
+        body.append([Path(r["file"]).name, *(plain(fine * r[k]) for k in keys), plain(fine * r["noise_rms"]), *(plain(fine * b) for b in beyond), unit])
+    when = (" before", " after") if repaired else ("",)
+    head = ["recording", *(f"rms error{w}" for w in when), "noise rms", *(f"beyond noise{w}" for w in when), "unit"]
+    note = "Beyond noise: the root of what the squared error exceeds the squared noise by."
+    return table("Errors of prediction", head, body, note, code=True)
+
+
+def intervals(fit) -> list[dict]:
+    """Intervals by resampling and by profile likelihood, where the fit was asked for them."""
+    made = []
+    boot, profile = fit.get("bootstrap"), fit.get("profile")
+    if boot:
+        rows = [[n, to_error(p["low"], p["deviation"]), to_error(p["high"], p["deviation"]), plain(p["deviation"], 2), plain(p["stderr"], 2),
+                 unit_text(p["unit"])] for n, p in boot["parameters"].items()]  # fmt: skip
+        caption = f"Bootstrap ({boot['kind']}), {boot['settled']} of {boot['draws']} draws settled: {100 * boot['level']:g} % intervals"
+        made.append(table(caption, ["parameter", "from", "to", "deviation of the draws", "std. error of the fit", "unit"], rows, code=True))
+    if profile:
+        rows = [[n, to_error(p["low"], p["stderr"]) + ("" if p["low_found"] else " (not closed)"),
+                 to_error(p["high"], p["stderr"]) + ("" if p["high_found"] else " (not closed)"), unit_text(p["unit"])]
+                for n, p in profile["parameters"].items()]  # fmt: skip
+        made.append(table(f"Profile likelihood: {100 * profile['level']:g} % intervals", ["parameter", "from", "to", "unit"], rows, code=True))
+    return made
 
 
 def numbers(fit) -> dict:

@@ -1,6 +1,7 @@
 """Write a result folder: the JSON that others read, the model, the evidence of the report, and the report itself."""
 
 import json
+import math
 import platform
 from importlib import metadata
 from pathlib import Path
@@ -40,7 +41,7 @@ def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduc
         write_model(folder, best.actuator, best.bench)
         found["drive"] = best.bench.drive
     _say(progress, "report: signals")
-    if diagnosis.verdict == "data_problem":
+    if diagnosis.verdict == "data_problem" or (base is not None and not math.isfinite(base.chi2_per_sample)):
         found["recordings"] = evidence.of_recordings(recordings, best.bench) if best is not None else {}
     elif base is not None:
         found["base"] = evidence.of_fit(base, inside=repaired is None)

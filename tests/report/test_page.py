@@ -1,0 +1,234 @@
+"""Every report: one file, offline, without script, small, well formed, and told to those who hear it."""
+
+import html.parser
+import json
+import shutil
+import subprocess
+import sys
+import xml.dom.minidom
+
+import numpy as np
+import pytest
+
+from fitting.report import rebuild
+from fitting.report.diagnosis_page import headline, interval, placebo_section
+from fitting.report.fit_page import sentence, validity
+from magjax.errors import ConfigurationError
+
+VOID = {"meta", "link", "br", "img", "hr", "input"}
+
+
+class Outline(html.parser.HTMLParser):
+    """Elements with their attributes and text; refuses tags that do not close."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.elements, self.closed = [], [], True
+        self.feed(text)
+        self.close()
+        assert not self.open, f"left open: {self.open}"
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append([tag, dict(attributes), "", [t for t, _ in self.open]])
+        if tag not in VOID:
+            self.open.append((tag, len(self.elements) - 1))
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append([tag, dict(attributes), "", [t for t, _ in self.open]])
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open and self.open[-1][0] == tag, f"</{tag}> closes {self.open[-1:]}"
+            self.open.pop()
+
+    def handle_data(self, data):
+        for _, index in self.open:
+            self.elements[index][2] += data
+
+    def all(self, *tags):
+        return [e for e in self.elements if e[0] in tags]
+
+
+def test_is_one_small_file_that_points_nowhere(html):
+    assert len(html.encode()) < 1_000_000
+    outline = Outline(html)
+    assert not outline.all("script", "iframe", "object", "embed", "img")
+    for tag, attributes, _, _ in outline.elements:
+        for key, value in attributes.items():
+            assert not key.startswith("on"), f"{tag} {key}"
+            if key in ("href", "src", "xlink:href", "action", "data"):
+                assert value.startswith(("#", "data:")), f"{tag} {key}={value[:60]}"
+            elif "url(" in (value or ""):
+                assert "url(#" in value
+    rest = html.replace("http://www.w3.org/2000/svg", "").replace("http://www.w3.org/1999/xlink", "")
+    assert "http://" not in rest and "https://" not in rest and "@import" not in html
+
+
+def test_reads_in_order(html):
+    outline = Outline(html)
+    levels = [int(e[0][1]) for e in outline.all("h1", "h2", "h3", "h4")]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(b <= a + 1 for a, b in zip(levels, levels[1:], strict=False)), levels
+    assert all(e[2].strip() for e in outline.all("h1", "h2", "h3"))
+    root = outline.all("html")[0][1]
+    assert root["lang"] == "en" and len(outline.all("main")) == 1
+    ids = [e[1]["id"] for e in outline.elements if "id" in e[1]]
+    assert len(ids) == len(set(ids)), "ids are not unique"
+    for tag, attributes, _, _ in outline.elements:
+        for key in ("aria-labelledby", "aria-describedby"):
+            assert attributes.get(key, ids[0]) in ids, f"{tag} {key}"
+        link = attributes.get("href") or attributes.get("xlink:href") or ""
+        assert not link.startswith("#") or link[1:] in ids, f"{tag} {link}"
+    skip = outline.all("a")[0]
+    assert skip[1]["href"] == "#result" and "skip" in skip[1]["class"]
+
+
+def test_every_figure_and_table_has_words(html, kind):
+    outline = Outline(html)
+    for _, attributes, text, parents in outline.all("svg"):
+        assert attributes["role"] == "img" and len(attributes["aria-label"]) > 5 and "figure" in parents
+        assert attributes["aria-describedby"].endswith("-desc")
+    assert len(outline.all("figcaption")) == len(outline.all("figure")) == len(outline.all("svg"))
+    assert all(len(e[2]) > 30 for e in outline.all("figcaption", "desc"))
+    assert len(outline.all("caption")) == len(outline.all("table"))
+    assert all(e[2].strip() and "scope" in e[1] for e in outline.all("th"))
+    captions = [e[2] for e in outline.all("caption")]
+    assert len(captions) == len(set(captions))
+    expected = {"fit": 10, "poor": 10, "attributed": 12, "group": 12, "unknown_at": 10, "nothing_missing": 10, "data_problem": 1, "unreadable": 0}
+    assert len(outline.all("svg")) >= expected[kind]
+
+
+def test_names_are_escaped(folders):
+    page = (folders["fit"] / "report.html").read_text(encoding="utf-8")
+    assert "rec &lt;b&gt;" in page and "rec <b>" not in page
+
+
+def test_svg_files_are_well_formed_and_nothing_is_half_written(folders, kind):
+    for path in (folders[kind] / "figures").glob("*.svg"):
+        xml.dom.minidom.parse(str(path))
+    assert not list(folders[kind].rglob("*.part"))
+
+
+def test_rebuilds_without_jax_and_tells_what_it_draws(folders, tmp_path):
+    for kind in ("fit", "attributed"):
+        copy = tmp_path / kind
+        shutil.copytree(folders[kind], copy)
+        (copy / "report.html").unlink()
+        code = (
+            f"import sys; from fitting.report import rebuild; said = []; rebuild({str(copy)!r}, said.append); "
+            "assert 'jax' not in sys.modules and len(said) > 8 and all(s.startswith('report: ') for s in said), said"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert (copy / "report.html").read_bytes() == (folders[kind] / "report.html").read_bytes()
+
+
+def test_rebuilds_from_the_numbers_alone(folders, tmp_path):
+    """A folder whose evidence was lost still gives its tables."""
+    for kind in ("fit", "attributed"):
+        name = "fit.json" if kind == "fit" else "diagnosis.json"
+        place = tmp_path / kind
+        place.mkdir()
+        shutil.copy(folders[kind] / name, place / name)
+        page = rebuild(place).read_text(encoding="utf-8")
+        assert page.count("<svg") <= 2 and "coil.R_eddy" in page  # ranking and convergence need the JSON alone
+    with pytest.raises(ConfigurationError, match="fit.json"):
+        rebuild(tmp_path)
+    (place / "diagnosis.json").write_text("{")
+    with pytest.raises(ConfigurationError, match="not valid JSON"):
+        rebuild(place)
+
+
+def test_the_banner_of_a_fit(folders):
+    good, bad = ((folders[k] / "report.html").read_text(encoding="utf-8") for k in ("fit", "poor"))
+    assert "the error bars hold" in good and 'class="banner good"' in good and "not valid" not in good
+    assert 'class="banner bad"' in bad and "std. error (not valid)" in bad
+    fit = json.loads((folders["fit"] / "fit.json").read_text())
+    assert validity(fit)[3] is True
+    tone, said, advice, valid = validity({**fit, "chi2_per_sample": 9.0})
+    assert tone == "bad" and "3 times the noise" in said and "diagnosis" in advice and not valid
+    assert validity({**fit, "chi2_per_sample": float("nan")})[0] == "bad"
+    assert validity({**fit, "converged": False})[0] == "bad"
+    assert validity({**fit, "chi2_per_sample": 1.4})[0] == "warn"
+    bound = {**fit["parameters"], "mechanics.xi": {**fit["parameters"]["mechanics.xi"], "at_bound": True}}
+    assert "mechanics.xi" in validity({**fit, "parameters": bound})[1]
+    loose = {**fit["parameters"], "mechanics.xi": {**fit["parameters"]["mechanics.xi"], "identified": False}}
+    assert "not identified: mechanics.xi" in validity({**fit, "parameters": loose})[1]
+
+
+def test_a_bad_fit_says_the_command_that_follows(folders, tmp_path):
+    fit = json.loads((folders["fit"] / "fit.json").read_text()) | {"chi2_per_sample": 9.0}
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    page = rebuild(tmp_path).read_text(encoding="utf-8")
+    assert "<code>magjax diagnose rec_*.csv --bench aa-050h --out result</code>" in page
+
+
+def test_the_verdict_comes_first_and_in_plain_words(folders, diagnoses):
+    for kind, found in diagnoses.items():
+        page = Outline((folders[kind] / "report.html").read_text(encoding="utf-8"))
+        first = next(e for e in page.elements if e[1].get("class") == "head")
+        assert first[2] == headline(found.as_dict()) and "_" not in first[2]
+    assert "amplifier lag" in headline(diagnoses["attributed"].as_dict())
+    assert "cannot say which" in headline(diagnoses["group"].as_dict())
+    assert "sensor" in headline(diagnoses["unknown_at"].as_dict())
+
+
+def test_a_diagnosis_shows_its_grounds(folders):
+    page = (folders["attributed"] / "report.html").read_text(encoding="utf-8")
+    heads = [e[2] for e in Outline(page).all("h2")]
+    assert heads.index("What was left out") < heads.index("Check recordings, before and after") < heads.index("The catalogue against the misfit")
+    for title in ("Where simulation and recordings differ", "Fitted recordings, before and after", "Parameter shifts", "Placebo: would the search cry wolf?"):
+        assert title in heads
+    assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
+    group = (folders["group"] / "report.html").read_text(encoding="utf-8")
+    assert "Next experiment" in group and "the coil current by a shunt" in group and "most likely first" in group
+
+
+def test_a_misfit_that_is_no_number_is_never_a_verdict(folders, tmp_path):
+    found = json.loads((folders["nothing_missing"] / "diagnosis.json").read_text())
+    found["base"]["chi2_per_sample"] = float("nan")
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    page = rebuild(tmp_path).read_text(encoding="utf-8")
+    assert 'class="banner bad"' in page and "broke down" in page and "Nothing is missing" not in page
+
+
+def test_the_placebo_panel():
+    said = placebo_section({"runs": 20, "false_alarms": 1, "named": {"creep": 1}}, "attributed")
+    text = json.dumps(said)
+    assert "20 searches" in text and "1 named" in text and "creep: 1" in text
+    assert "Not run" in json.dumps(placebo_section(None, "attributed"))
+    assert placebo_section(None, "data_problem") is None
+    low, high = interval(0, 20)
+    assert low == 0 and high == pytest.approx(0.161, abs=2e-3)  # Wilson: z^2 / (n + z^2)
+
+
+def test_messages_read_as_sentences():
+    assert sentence("rec_1.csv: it drifts") == "rec_1.csv: it drifts."
+    assert sentence("excess loss: chi2/N falls. check: 4.81e-08 -> 4.6e-08 m; 1e-3 m") == "Excess loss: χ²/N falls. check: 48.1 → 46 nm; 1e-3 m."
+    assert sentence("") == ""
+
+
+def test_many_recordings_stay_below_a_megabyte(folders, tmp_path):
+    """Twelve drawn of forty, each with noise of its own, before and after, and twelve check recordings."""
+    from fitting.report import store
+
+    found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
+    evidence = store.load(folders["attributed"])
+    rng = np.random.default_rng(0)
+    for key in ("base", "repaired"):
+        part = evidence[key]
+        for name in ("name", "frequency", "periods", "noise", "chi2", "rms"):
+            part[name] = np.tile(part[name], 14)[:40]
+        part["chosen"] = np.arange(12)
+        for which in ("loops", "trace"):
+            old = part[which]
+            part[which] = {str(k): dict(old[str(k % 3)]) for k in range(12)}
+        for loop in part["loops"].values():
+            loop["model"] = loop["model"] + 1e-7 * rng.standard_normal(len(loop["model"]))
+        for which in ("measured", "misfit", "floor"):
+            part["lines"][which] = np.tile(part["lines"][which], (14, 1))[:40]
+    evidence["checks"] = {str(k): evidence["checks"]["0"] for k in range(12)}
+    found["check"] = found["check"] * 12
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    store.save(tmp_path, evidence)
+    assert rebuild(tmp_path).stat().st_size < 1_000_000
