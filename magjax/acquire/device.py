@@ -1,7 +1,8 @@
 """The device side of docs/protocol.md as a state machine without wires: payloads in, payloads out, a clock given from outside.
 
 `response` turns a drive into readings: `response.channels` (name, unit, scale, offset), and
-`response.prepare(drive in A, rate, repeats, samples) -> (start, period)`, SI, (time, channels): what is read once, then again and again.
+`response.prepare(drive in A, rate, repeats, samples) -> (start, period)`, SI, (time, channels): what is read once, then again and again;
+`response.ended(samples)` tells when a run is over.
 """
 
 import json
@@ -32,6 +33,8 @@ class Device:
 
     def boot(self, now: float) -> bytes:
         """Start anew: another boot_id, nothing running, the drive at zero. Returns the HELLO."""
+        if getattr(self, "running", False):
+            self.response.ended(self.samples)
         self.boot_id = secrets.token_hex(4)
         self.table, self.repeats, self.filled = np.zeros(0, "<i2"), 0, 0
         self.running, self.last, self.run, self.prepared = False, None, None, None
@@ -187,6 +190,8 @@ class Device:
 
     def finish(self, reason: int) -> bytes:
         """End the run, drive to zero; FINAL."""
+        if self.running:
+            self.response.ended(self.samples)
         self.running = False
         self.last = p.Final(
             reason, self.run or 0, (self.first_seq + self.frames - 1) & 0xFFFFFFFF, self.frames, self.samples, self.dropped

@@ -1,11 +1,12 @@
 """What an emulated bench answers to a drive: a plain amplifier for tests, or the bench model with concealed effects.
 
-Every run starts from the bench's start state: runs do not remember each other.
+The bench's material remembers its runs (material.py): what a drive leaves behind is where the next one starts.
 """
 
 import numpy as np
 
 from ..errors import ConfigurationError
+from .material import Material
 
 REST = 50e-6  # m: where the middle of the displacement converter lies
 
@@ -32,6 +33,9 @@ class PlainResponse:
         rest = np.array([[0.0, REST]])
         return np.tile(period, (repeats, 1)), rest
 
+    def ended(self, samples) -> None:
+        """The run is over after so many samples: there is nothing to remember."""
+
 
 class BenchResponse:
     """The bench model with other constants and concealed effects, as `fitting.demo` conceals them.
@@ -52,37 +56,67 @@ class BenchResponse:
             )
         self.channels = converter(displacement_noise, current_noise)
         self.shift = shift
+        past, h = self.actuator.hysteresis.rested(), self.actuator.hysteresis
+        rest = float(self.actuator.coil.applied_field(0.0))
+        self.material = Material(np.asarray(h.masses), float(h.low), float(h.high), rest, np.asarray(past.history))
+        self.fields = None
 
     def prepare(self, drive, rate, repeats, samples):
         """Readings for a drive in A: the first periods from rest, then the steady period."""
         if np.ptp(drive) == 0:
             drive = drive + np.linspace(0, 1e-9, len(drive))
+        few = self.material.few()
         if repeats == 1:
-            start = self._run(drive, rate, False)
+            start, first = self._run(drive, rate, few, self.material.start(few))
+            self.fields = first, first[-1:]
             return start, start[-1:] * 1.0
-        steady = self._run(drive, rate, True)
-        start = self._run(np.tile(drive, 2), rate, False)
+        steady, again = self._run(drive, rate)
+        for _ in range(2):  # a second time for benches whose field depends on M
+            lowest, highest = float(again.min()), float(again.max())
+            level = self.material.level(self.material.past, lowest, highest)
+            steady, again = self._run(drive, rate, level=level)
+        start, first = self._run(np.tile(drive, 2), rate, few, level - self.material.level(few, lowest, highest))
+        self.fields = first, again
         if any(e.record_level for e in self.actuator.effects) and samples:
             return self._whole(start, steady, rate, samples), steady
         if repeats:
             return np.concatenate([start, np.tile(steady, (max(repeats - 2, 0), 1))])[: repeats * len(drive)], steady[-1:]
         return start, steady
 
-    def _run(self, drive, rate, periodic):
+    def ended(self, samples) -> None:
+        """The run is over after so many samples, and the drive at zero: the material remembers it."""
+        if self.fields is None:
+            return
+        first, period = self.fields
+        more = samples - len(first)
+        if more > 0:
+            first = np.concatenate([first, period, period[: more % len(period)]])
+        self.material.run(first[:samples] if more <= 0 else first)
+        self.fields = None
+
+    def _run(self, drive, rate, history=None, level=0.0):
+        """(readings (time, 2), fields that the relays see (time,)) of a drive: periodic, or after a history; M raised by `level`."""
+        import equinox as eqx
+
         from ..simulate import simulate
 
+        periodic = history is None
         instant = [e for e in self.actuator.effects if not e.record_level]
         actuator = self.actuator
         for effect in actuator.effects:
             actuator = actuator.without_effect(effect.name)
         for effect in instant:
             actuator = actuator.with_effect(effect)
+        h = actuator.hysteresis
+        past = np.zeros(0) if periodic else history
+        actuator = eqx.tree_at(lambda a: (a.hysteresis.history, a.hysteresis.rest, a.hysteresis.offset), actuator,
+                               (past + 0 * h.low, h.low, h.offset + level))  # fmt: skip
         signals = simulate(actuator, drive, 1 / rate, periodic=periodic)
         reading = np.asarray(signals.reading)
         if self.shift:
             at = np.arange(len(drive)) - self.shift * rate
             reading = np.interp(at, np.arange(len(drive)), reading, period=len(drive) if periodic else None)
-        return np.stack([np.asarray(signals.current), reading], axis=1)
+        return np.stack([np.asarray(signals.current), reading], axis=1), np.asarray(signals.relay_field)
 
     def _whole(self, start, steady, rate, samples):
         """The whole record, with drift, heat and hum over its time."""
