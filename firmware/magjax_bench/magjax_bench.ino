@@ -49,10 +49,10 @@ bool sendFrame(uint8_t *payload, size_t n, bool mayDrop) {
   n += 4;
   size_t code = 0, at = 1;
   for (size_t k = 0; k < n; k++) {
-    if (payload[k] && at - code < 0xFF) { wire[at++] = payload[k]; continue; }
+    if (at - code == 0xFF) { wire[code] = 0xFF; code = at++; }  // 254 bytes without a zero: no zero is meant behind them
+    if (payload[k]) { wire[at++] = payload[k]; continue; }
     wire[code] = at - code;
     code = at++;
-    if (payload[k]) wire[at++] = payload[k];
   }
   wire[code] = at - code;
   wire[at++] = 0;
