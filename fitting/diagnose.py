@@ -18,7 +18,7 @@ from .fit import REFINE_BETWEEN, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
 from .locate import where
 from .screen import offset_score, screen
-from .setup import Choices
+from .setup import Choices, spectra_of
 
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 Z_THRESHOLD = 5.5  # about forty columns are looked at
@@ -80,13 +80,22 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
     say = progress or (lambda *a: None)
     recordings = list(recordings)
     held = tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
-    base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
-    problem = data_problem(recordings, base.spectra, bench.output) or wrong_bench(base)
+    spectra = spectra_of(recordings, bench, choices.harmonics)
+    say("between the harmonics", 0, None)
+    problem = data_problem(recordings, spectra, bench.output)
     if problem:
+        base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress, refine=False)
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
-    base, zero = _sensor_zero(recordings, bench, base, actuator, held, choices, progress)
-    say("between the harmonics", 0, base.chi2_per_sample)
-    adopted, recordings, base_now = _record_level(recordings, bench, base, choices, progress)
+    adopted, cleaned = _record_level(recordings, spectra, bench, choices)
+    base_now = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
+    if problem := wrong_bench(base_now):
+        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base_now)
+    base_now, zero = _sensor_zero(cleaned, bench, base_now, actuator, held, choices, progress)
+    base = base_now
+    if adopted:  # what the plain model makes of the readings as they came
+        free = held if zero is None else (*held, "sensor.offset")
+        base = fit(recordings, bench, actuator=actuator, extra=free, choices=base_now.choices, progress=progress, refine=False)
+    recordings = cleaned
     candidates = screen(base_now.problem, base_now.refined)
     noise = base_now.problem.noise_rms
     floors = {
@@ -117,19 +126,19 @@ def _sensor_zero(recordings, bench, base, actuator, held, choices, progress):
     return freed, freed.estimate("sensor.offset").value
 
 
-def _record_level(recordings, bench, base, choices, progress):
-    """Drift, heat and hum: adopted one by one, taken out of the readings, the base fitted again."""
-    adopted, current = [], base
-    for _ in range(0 if base.problem.quasistatic or bench.output != "displacement" else 2):
-        found = [e for e in record_effects(recordings, current.spectra) if e.name not in {a.name for a, _ in adopted}]
+def _record_level(recordings, spectra, bench, choices):
+    """Drift, heat and hum, scored between the harmonics: (adopted with their rivals, the recordings without them)."""
+    adopted = []
+    for _ in range(0 if bench.columns.get("time", {}).get("quasistatic") or bench.output != "displacement" else 2):
+        found = [e for e in record_effects(recordings, spectra) if e.name not in {a.name for a, _ in adopted}]
         best = found[0]
         if abs(best.z) < RECORD_Z:
             break
         rivals = [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z)]
         adopted.append((best, rivals))
         recordings = remove_record_effect(recordings, best, bench.output)
-        current = fit(recordings, bench, actuator=base.actuator if base.actuator.effects else None, choices=choices, progress=progress)
-    return adopted, recordings, current
+        spectra = spectra_of(recordings, bench, choices.harmonics)
+    return adopted, recordings
 
 
 @dataclasses.dataclass

@@ -12,6 +12,9 @@ import numpy as np
 from .model import Predictor, predicted_lines
 from .spectra import fit_lines
 
+MAINS = (50.0, 60.0)
+HUM_TONES = 3
+
 
 @dataclasses.dataclass(frozen=True)
 class RecordEffect:
@@ -61,30 +64,48 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
         z, amplitude = top / np.sqrt(bottom), top / bottom
         if name not in found or abs(z) > abs(found[name].z):
             found[name] = RecordEffect(name, float(z), float(amplitude), float(1 / np.sqrt(bottom)), shapes, tuple(columns))
-    longest = max(s.samples * s.dt for s in spectra)
-    for f in (50.0, 60.0):
-        enough = min(2 / f, longest * 0.999)  # a shorter record cannot tell a tone from slow noise: it takes no part in the score
-        gain, power, number = 0.0, 0.0, 0
-        fits = []
-        for s in spectra:
-            t = s.dt * np.arange(s.samples)
-            parts = [np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]
-            reduced = [_between(s, p) for p in parts]
-            G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
-            g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
-            if np.trace(G) < 1e-3 * s.samples / max(s.noise_rms**2, 1e-300):
-                fits.append(np.zeros(s.samples))
-                continue
-            best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(2), g)
-            if s.samples * s.dt >= enough:
-                gain += float(best @ g)
-                number += 2
-            power = max(power, float(np.hypot(*best)))
-            fits.append(best[0] * parts[0] + best[1] * parts[1])
-        z = (gain - number) / np.sqrt(2 * max(number, 1))
+    for f in MAINS:
+        z, tones, fits = _hum(spectra, f)
         if "mains_hum" not in found or z > found["mains_hum"].z:
-            found["mains_hum"] = RecordEffect("mains_hum", float(z), power, power / max(np.sqrt(gain), 1e-9), {"f": f}, tuple(fits))
+            error = tones[0][1] / max(np.sqrt(max(z, 1.0)), 1e-9)
+            found["mains_hum"] = RecordEffect("mains_hum", float(z), tones[0][1], float(error), {"f": f, "tones": tones}, tuple(fits))
     return sorted(found.values(), key=lambda e: -abs(e.z))
+
+
+def _hum(spectra, mains):
+    """Hum of one mains frequency and its first harmonics, a phase of its own in each record: (z, tones, fits).
+
+    `tones`: (frequency, largest amplitude over the records) of each; a tone that falls on a harmonic of the drive cannot be
+    told from the reading there, and a record shorter than two of its periods tells no tone from slow noise: it takes no
+    part in the score.
+    """
+    longest = max(s.samples * s.dt for s in spectra)
+    frequencies = [k * mains for k in range(1, HUM_TONES + 1)]
+    gain, number, power, fits = 0.0, 0, np.zeros(HUM_TONES), []
+    for s in spectra:
+        t = s.dt * np.arange(s.samples)
+        parts, kinds = [], []
+        for k, f in enumerate(frequencies):
+            pair = [np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]
+            reduced = [_between(s, p) for p in pair]
+            seen = sum(np.sum(np.abs(c) ** 2) for _, _, c in reduced) / sum(np.sum(np.abs(np.fft.rfft(p)) ** 2) for p in pair)
+            if f < 0.45 / s.dt and seen > 0.05:
+                parts += list(zip(pair, reduced, strict=True))
+                kinds += [k, k]
+        if not parts:
+            fits.append(np.zeros(s.samples))
+            continue
+        G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for _, b in parts] for _, a in parts])
+        g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for _, a in parts])
+        best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(len(G)), g)
+        if s.samples * s.dt >= min(2 / mains, longest * 0.999):
+            gain += float(best @ g)
+            number += len(g)
+        for k in set(kinds):
+            power[k] = max(power[k], float(np.linalg.norm(best[np.asarray(kinds) == k])))
+        fits.append(sum(x * p for x, (p, _) in zip(best, parts, strict=True)))
+    z = (gain - number) / np.sqrt(2 * max(number, 1))
+    return z, tuple((f, float(p)) for f, p in zip(frequencies, power, strict=True)), fits
 
 
 def _between(s, column):
@@ -111,7 +132,7 @@ def remove_record_effect(recordings, effect, output):
         channels = {**recording.channels, output: recording.channels[output] - signal}
         origin = recording.origin
         if effect.name == "mains_hum":
-            origin = {**origin, "hum": (effect.shapes["f"], effect.amplitude)}
+            origin = {**origin, "hum": effect.shapes["tones"]}
         cleaned.append(Recording(recording.time, channels, recording.noise, origin, recording.name))
     return cleaned
 

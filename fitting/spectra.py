@@ -40,7 +40,7 @@ class Spectrum:
     noise: object = None
     systematic: np.ndarray | None = None  # what the converters leave in each reading line, deviation of its parts
     gain_accuracy: float = 0.0  # the reading's scale in this recording, relative standard deviation
-    hum: tuple[float, float] | None = None  # frequency, Hz, and amplitude of a hum taken out where it can be told
+    hum: tuple[tuple[float, float], ...] | None = None  # frequency, Hz, and amplitude of tones taken out where they can be told
 
     @property
     def noise_rms(self) -> float:
@@ -217,11 +217,11 @@ def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
     lowest = spectrum.frequency / max(spectrum.periods, 1)
     f = np.maximum(np.arange(count) * spectrum.frequency, lowest)
     variance = noise.density(f) / spectrum.samples
-    if spectrum.hum is not None:
+    for tone, amplitude in spectrum.hum or ():
         # lines on the hum carry it with an unknown phase, lines beside it what its removal left: they count for less
-        away = np.abs(np.arange(count) * spectrum.frequency - spectrum.hum[0])
+        away = np.abs(np.arange(count) * spectrum.frequency - tone)
         left = np.where(away < 0.6 * lowest, 1.0, 0.25 * np.minimum(1.0, lowest / (np.pi * np.maximum(away, lowest))))
-        variance = variance + (left * spectrum.hum[1]) ** 2 / 4
+        variance = variance + (left * amplitude) ** 2 / 4
     variance = np.where(np.arange(count) == 0, variance, 0.5 * variance)
     return np.sqrt(variance if spectrum.systematic is None else variance + spectrum.systematic**2)
 
