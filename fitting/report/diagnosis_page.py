@@ -5,11 +5,18 @@ import math
 
 from . import found as pictures
 from . import loops, misfit, plane, tables
-from .fit_page import convergence_part, headed, residual_section, sentence
+from .fit_page import convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
 from .style import percent, plain, scale_of, unit_text
 
-TONES = {"nothing_missing": "good", "attributed": "info", "group": "warn", "absorbed": "warn", "unknown_at": "warn", "data_problem": "bad"}
+TONES = {
+    "nothing_missing": "good",
+    "attributed": "info",
+    "group": "warn",
+    "absorbed": "warn",
+    "unknown_at": "warn",
+    "data_problem": "bad",
+}
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
 
@@ -27,7 +34,9 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         _groups(found, facts),
         _unknown(found),
         section("Next experiment", *_next(found)),
-        section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"), output)),
+        section(
+            "The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"), output)
+        ),
         _checks(found, evidence, sketch, output, drive),
         _where(found, base, sketch, output),
         _ranking(found, facts, sketch),
@@ -40,11 +49,19 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     ]
     count = len(fit.get("recordings", []))
     plural = lambda n, what: f"{n} {what}{'' if n == 1 else 's'}"
-    about = f"Bench {fit['bench']}; {plural(count, 'recording')}, {plural(len(found['check']), 'check recording')}." if fit else "No model could be fitted."
+    about = (
+        f"Bench {fit['bench']}; {plural(count, 'recording')}, {plural(len(found['check']), 'check recording')}."
+        if fit
+        else "No model could be fitted."
+    )
     message = found["message"]
     for name in sorted({c["name"] for c in found["candidates"]} | set(facts), key=len, reverse=True):
         message = message.replace(name, words(name))
-    said = "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file." if broken else ""
+    said = (
+        "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file."
+        if broken
+        else ""
+    )
     return {
         "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else TONES.get(found["verdict"], "bad"),
         "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
@@ -81,13 +98,20 @@ def _named(found, facts):
         return None
     rows, laws = [], []
     for e in found["effects"]:
-        size = "; ".join(f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'] if p['unit'] != '1' else '')}".strip() for n, p in e["parameters"].items())
+        size = "; ".join(
+            f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'] if p['unit'] != '1' else '')}".strip()
+            for n, p in e["parameters"].items()
+        )
         rows.append([words(e["name"]), e["block"], size, plain(e["confidence"], 2)])
         about = facts.get(e["name"], {})
         if about.get("law"):
             laws.append(f"{words(e['name'])}: {about['law']}. How it shows: {about['signature']}. Source: {about['source']}.")
     note = "Confidence: probability of the effect among those that were fitted, times the share of the excess misfit that it takes."
-    return section("What was left out", part(table=tables.table("Effects found", ["effect", "block", "size", "confidence"], rows, note)), part(bullets=laws))
+    return section(
+        "What was left out",
+        part(table=tables.table("Effects found", ["effect", "block", "size", "confidence"], rows, note)),
+        part(bullets=laws),
+    )
 
 
 def _groups(found, facts):
@@ -100,7 +124,9 @@ def _groups(found, facts):
             rows.append([words(name), number, place, about.get("block", ""), about.get("signature", "")])
     text = "Each of these would repair the model about as well as the others; to name one from these recordings would be a guess."
     head = ["rival", "group", "rank in its group", "block", "how it shows"]
-    return section("Not told apart by these recordings", part(text=text, table=tables.table("Rivals, most likely first", head, rows)))
+    return section(
+        "Not told apart by these recordings", part(text=text, table=tables.table("Rivals, most likely first", head, rows))
+    )
 
 
 def _unknown(found):
@@ -108,7 +134,11 @@ def _unknown(found):
     if not unknown:
         return None
     rows = [["block it acts most like", unknown.get("block", "")], ["region", unknown.get("region", "")]]
-    rows += [["share of the excess that the nearest effect explains", percent(unknown["explained_share"])]] if "explained_share" in unknown else []
+    rows += (
+        [["share of the excess that the nearest effect explains", percent(unknown["explained_share"])]]
+        if "explained_share" in unknown
+        else []
+    )
     return section("What is known of it", part(table=tables.table("The unknown", ["question", "answer"], rows)))
 
 
@@ -120,7 +150,9 @@ def _next(found):
     channels = [c for c in ask.get("channels", []) if c]
     parts.append(part(text=f"Channels to record: {'; '.join(channels)}.") if channels else None)
     rows = [[words(a), words(b), plain(p, 2)] for a, b, p in ask.get("separates", [])]
-    parts.append(part(table=tables.table("What it separates", ["effect", "from", "probability of the right name"], rows)) if rows else None)
+    parts.append(
+        part(table=tables.table("What it separates", ["effect", "from", "probability of the right name"], rows)) if rows else None
+    )
     return parts
 
 
@@ -164,7 +196,9 @@ def power(candidate, facts) -> str:
 
 
 def _ranking(found, facts, sketch):
-    ranked = sorted((c for c in found["candidates"] if math.isfinite(c["z"] if c["z"] is not None else math.nan)), key=lambda c: -abs(c["z"]))
+    ranked = sorted(
+        (c for c in found["candidates"] if math.isfinite(c["z"] if c["z"] is not None else math.nan)), key=lambda c: -abs(c["z"])
+    )
     if not ranked:
         return None
     rows = []
@@ -175,7 +209,18 @@ def _ranking(found, facts, sketch):
         bic = plain(c["bic_change"]) if c["bic_change"] is not None else ""
         rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), f"{plain(c['amplitude'])}{unit}",
                      f"{plain(c['smallest_visible'])}{unit}", power(c, facts), plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
-    head = ["effect", "block", "z", "visibility", "amplitude, first order", "visible from", "power", "χ² fall, predicted", "achieved", "change of BIC"]
+    head = [
+        "effect",
+        "block",
+        "z",
+        "visibility",
+        "amplitude, first order",
+        "visible from",
+        "power",
+        "χ² fall, predicted",
+        "achieved",
+        "change of BIC",
+    ]
     note = (
         "z: score in standard deviations. Visibility: what share of its mark the base model cannot imitate. Visible from: amplitude seen at five "
         "standard deviations. Power: probability that these recordings would show the effect at the top of its typical range."
@@ -183,12 +228,19 @@ def _ranking(found, facts, sketch):
     absorbed = ", ".join(words(n) for n in found["absorbed"])
     text = f"These recordings could not show {absorbed}: the density imitates them." if absorbed else ""
     drawn = sketch(ranked, pictures.ranking, ranked)
-    return section("The catalogue against the misfit", drawn, part(table=tables.table("Every candidate, best first", head, rows, note)), part(text=text))
+    return section(
+        "The catalogue against the misfit",
+        drawn,
+        part(table=tables.table("Every candidate, best first", head, rows, note)),
+        part(text=text),
+    )
 
 
 def repair_words(found) -> str:
     """What to call the model with the additions of the search."""
-    return {"unknown_at": "the nearest repair tried", "group": "the model with the leading rival"}.get(found["verdict"], "the repaired model")
+    return {"unknown_at": "the nearest repair tried", "group": "the model with the leading rival"}.get(
+        found["verdict"], "the repaired model"
+    )
 
 
 def _left(found, base, repaired, sketch, output):
@@ -196,7 +248,10 @@ def _left(found, base, repaired, sketch, output):
         return residual_section(sketch, base, output, "What the plain model leaves", with_map=False) if base else None
     return section(
         f"What {repair_words(found)} leaves",
-        *headed("By frequency and harmonic", sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise")),
+        *headed(
+            "By frequency and harmonic",
+            sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise"),
+        ),
         *headed("Against field, rate and frequency", sketch(repaired, misfit.against, repaired, "against-after")),
         *headed("Autocorrelation", sketch(repaired, misfit.autocorrelation, repaired, "autocorrelation-after")),
         *headed("Spectrum", sketch(repaired, misfit.spectrum, repaired, output, "spectrum-after")),
@@ -211,12 +266,24 @@ def _shifts(found):
             error = after.get(name, {}).get("stderr", 0.0)
             apart = plain(abs(now - before) / error, 2) if error else "–"
             share = f"{100 * (before - now) / abs(now):+.2g} %".replace("-", "−") if now else "–"
-            rows.append([name, words(e["name"]), tables.to_error(before, error), tables.to_error(now, error), unit_text(after.get(name, {}).get("unit", "")), share, apart])
+            rows.append(
+                [
+                    name,
+                    words(e["name"]),
+                    tables.to_error(before, error),
+                    tables.to_error(now, error),
+                    unit_text(after.get(name, {}).get("unit", "")),
+                    share,
+                    apart,
+                ]
+            )
     if not rows:
         return None
     text = "To make up for what it lacked, the plain model had bent these constants; beside each, what it had got wrong."
     head = ["parameter", "when adding", "before", "after", "unit", "was wrong by", "in standard errors"]
-    return section("Parameter shifts", part(text=text, table=tables.table("Constants before and after the repair", head, rows, code=True)))
+    return section(
+        "Parameter shifts", part(text=text, table=tables.table("Constants before and after the repair", head, rows, code=True))
+    )
 
 
 def placebo_section(placebo, verdict):
@@ -236,8 +303,10 @@ def placebo_section(placebo, verdict):
     if number and false is not None:
         low, high = interval(false, number)
         parts.append(
-            part(text=f"In {number} searches on recordings simulated from the repaired model, {false} named something more, where nothing more was "
-                      f"({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)}).")  # fmt: skip
+            part(
+                text=f"In {number} searches on recordings simulated from the repaired model, {false} named something more, where nothing more was "
+                f"({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)})."
+            )  # fmt: skip
         )
     rows = [[words(str(k)), _shown(v)] for k, v in placebo.items()]
     return section(title, *parts, part(table=tables.table("The placebo in numbers", ["quantity", "value"], rows)))
@@ -263,11 +332,10 @@ def _models(found, evidence, sketch, drive):
     base, repaired = found["base"], found["repaired"]
     best = evidence.get("repaired") or evidence.get("base") or {}
     if repaired:
-        valid = repaired["converged"] and repaired["chi2_per_sample"] < 1.3
         yield section(
             sentence(repair_words(found)).rstrip("."),
             part(text=sentence(repaired["message"])),
-            *(part(table=t) for t in tables.parameters(repaired, valid, f"Parameters of {repair_words(found)}")),
+            *(part(table=t) for t in tables.parameters(repaired, validity(repaired)[3], f"Parameters of {repair_words(found)}")),
             part(table=tables.correlations(repaired)),
             sketch(best, plane.mass_map, best),
             sketch(best.get("inside"), loops.inside, best, drive),
@@ -275,11 +343,11 @@ def _models(found, evidence, sketch, drive):
         )
     if base:
         spoilt = found["verdict"] == "data_problem" or not math.isfinite(base["chi2_per_sample"])
-        valid = base["converged"] and base["chi2_per_sample"] < 1.3 and not spoilt
+        doubt = "not valid" if spoilt else validity(base)[3]
         yield section(
             "A fit to them as they are (not to be used)" if spoilt else "The plain model",
             part(text=sentence("" if spoilt else base["message"])),
-            *(part(table=t) for t in tables.parameters(base, valid, "Parameters of the plain model")[: 1 if repaired else 2]),
+            *(part(table=t) for t in tables.parameters(base, doubt, "Parameters of the plain model")[: 1 if repaired else 2]),
             part(table=tables.recordings(base)),
             *([] if repaired else [sketch(best, plane.mass_map, best), sketch(best.get("inside"), loops.inside, best, drive)]),
         )
@@ -291,5 +359,7 @@ def _floors(found, output):
         "noise_rms": "noise between the harmonics", "solver_rms": "change of the simulation when its step is halved",
         "density_rms": "what a smooth density may leave",
     }  # fmt: skip
-    rows = [[meaning.get(k, words(k)), f"{plain(fine * v)} {unit}"] for k, v in found["floors"].items() if isinstance(v, (int, float))]
+    rows = [
+        [meaning.get(k, words(k)), f"{plain(fine * v)} {unit}"] for k, v in found["floors"].items() if isinstance(v, (int, float))
+    ]
     return tables.table("The floors below which nothing is claimed", ["floor", "rms"], rows) if rows else None

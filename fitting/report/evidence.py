@@ -25,7 +25,9 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
     misfit = model_misfit(result)
     spectra = problem.spectra
     chosen = chosen_recordings(result) if chosen is None else chosen
-    applied = [np.asarray(result.actuator.coil.applied_field(s.drive_at(np.arange(s.samples) * s.dt * s.frequency))) for s in spectra]
+    applied = [
+        np.asarray(result.actuator.coil.applied_field(s.drive_at(np.arange(s.samples) * s.dt * s.frequency))) for s in spectra
+    ]
     residuals = [evaluate_lines(m, _phases(s)) - s.residue for m, s in zip(misfit, spectra, strict=True)]
     noise = np.array([max(s.noise_rms, 1e-300) for s in spectra])
     scaled = [r / n for r, n in zip(residuals, noise, strict=True)]

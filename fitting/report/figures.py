@@ -38,7 +38,16 @@ def lag_table(table, stem: str = "lag_table"):
             colour = INK if picked else colours(0.9 * k / len(table.xi))
             axes.plot(table.frequencies, row, marker="o", ms=3, lw=2.2 if picked else 0.8, color=colour)
             if k % 2 == 0 or picked:
-                axes.annotate(f"{R:g} ohm", (table.frequencies[0], row[0]), fontsize=7, textcoords="offset points", xytext=(-6, -2), ha="right")
+                axes.annotate(
+                    f"{R:g} ohm",
+                    (table.frequencies[0], row[0]),
+                    fontsize=7,
+                    textcoords="offset points",
+                    xytext=(-6, -2),
+                    ha="right",
+                )
         axes.set(xlabel="frequency / Hz", ylabel="damping ratio ξ", ylim=(0, 1.6), xlim=(-25, None))
-        caption = "Damping ratio from the phase lag against frequency, one line for each R_eddy of the mesh; the picked one is thick."
+        caption = (
+            "Damping ratio from the phase lag against frequency, one line for each R_eddy of the mesh; the picked one is thick."
+        )
         return picture(figure, stem, "Damping ratio against frequency for each R_eddy", caption)

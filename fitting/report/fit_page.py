@@ -7,42 +7,53 @@ from .page import Sketch, part, section
 from .style import plain
 
 NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
-AT_NOISE, FAR = 1.1, 2.0  # chi2/N: below it the error bars hold; above it they mean nothing
+BELOW_NOISE, AT_NOISE, FAR = 0.5, 1.1, 2.0  # chi2/N: noise overstated; the error bars hold; they mean nothing
 WORST_AT_NOISE = 1.6
 
 
-def validity(fit) -> tuple[str, str, str, bool]:
-    """(tone, headline, advice, whether the error bars hold) of a fit."""
+def validity(fit) -> tuple[str, str, str, str]:
+    """(tone, headline, advice, doubt about the error bars) of a fit; the doubt is a key of `tables.DOUBTS`."""
     chi2 = fit["chi2_per_sample"]
     bound = [n for n, p in fit["parameters"].items() if p["at_bound"]]
     loose = [n for n, p in fit["parameters"].items() if p["free"] and not p["identified"]]
     worst = max((r["chi2_per_sample"] for r in fit["recordings"]), default=chi2)
     ask = "Run the diagnosis on the same files; it says what physics is missing, and where:"
     if not fit["converged"]:
-        return "bad", "Not converged: these numbers are not a result", "Raise --max-jacobians, or start nearer with --model.", False
+        mend = "Raise --max-jacobians, or start nearer with --model."
+        return "bad", "Not converged: these numbers are not a result", mend, "not valid"
     if chi2 is None or chi2 != chi2:
-        return "bad", "The misfit is not a number: these numbers are not a result", "Check the signs and units of the channels in the bench file.", False
+        mend = "Check the signs and units of the channels in the bench file."
+        return "bad", "The misfit is not a number: these numbers are not a result", mend, "not valid"
     if chi2 > FAR:
-        return "bad", f"Error bars not valid: the residual is {plain(chi2**0.5, 2)} times the noise", ask, False
+        return "bad", f"Error bars not valid: the residual is {plain(chi2**0.5, 2)} times the noise", ask, "not valid"
     if bound:
-        return "bad", f"At a bound: {', '.join(bound)}", "A parameter at its bound takes the blame for something else; free another, or check the bench file.", False
+        mend = "A parameter at its bound takes the blame for something else; free another, or check the bench file."
+        return "bad", f"At a bound: {', '.join(bound)}", mend, "not valid"
     if chi2 > AT_NOISE or worst > WORST_AT_NOISE:
         where = "" if chi2 > AT_NOISE else " in one recording"
-        return "warn", f"A little above the noise{where} (χ²/N = {plain(chi2)}): error bars are too narrow", ask, False
+        return "warn", f"A little above the noise{where} (χ²/N = {plain(chi2)}): error bars are too narrow", ask, "too narrow"
     if loose:
-        return "warn", f"At the noise, but not identified: {', '.join(loose)}", "These recordings do not determine it; record another range, or hold it fixed.", True
-    return "good", f"At the noise (χ²/N = {plain(chi2)}): the error bars hold", "", True
+        mend = "These recordings do not determine it; record another range, or hold it fixed."
+        return "warn", f"At the noise, but not identified: {', '.join(loose)}", mend, ""
+    if chi2 < BELOW_NOISE:
+        mend = "The noise or the converters' errors that were assumed are larger than those in the recordings."
+        return "good", f"Below the noise that was assumed (χ²/N = {plain(chi2)}): the error bars are on the safe side", mend, ""
+    return "good", f"At the noise (χ²/N = {plain(chi2)}): the error bars hold", "", ""
 
 
 def fit_page(fit, evidence, say=lambda text: None) -> dict:
     """The page's words, tables and pictures; `say(text)` before each picture."""
-    tone, headline, advice, valid = validity(fit)
+    tone, headline, advice, doubt = validity(fit)
     output, drive = _quantities(fit, evidence)
     sketch = Sketch(say)
     number = len(fit["recordings"])
     span = sorted(r["frequency"] for r in fit["recordings"])
     sections = [
-        section("Parameters", *(part(table=t) for t in (*tables.parameters(fit, valid), *tables.intervals(fit))), part(table=tables.correlations(fit))),
+        section(
+            "Parameters",
+            *(part(table=t) for t in (*tables.parameters(fit, doubt), *tables.intervals(fit))),
+            part(table=tables.correlations(fit)),
+        ),
         section("Recordings", part(table=tables.recordings(fit))),
         section(
             "Measured and fitted",

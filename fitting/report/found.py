@@ -28,9 +28,16 @@ def block_map(where, found_in, output: str, stem: str = "blocks"):
             axes.add_patch(_box(left, wide - 0.03, tint, 2.4 if named else 0.8))
             axes.text(left + 0.5 * (wide - 0.03), 0.70, block, ha="center", va="center", fontweight="bold" if named else "normal")
             axes.text(left + 0.5 * (wide - 0.03), 0.47, percent(share), ha="center", va="center", fontsize=11)
-            axes.text(left + 0.5 * (wide - 0.03), 0.25, "effect named here" if named else "", ha="center", va="center", fontsize=7.5)
+            axes.text(
+                left + 0.5 * (wide - 0.03), 0.25, "effect named here" if named else "", ha="center", va="center", fontsize=7.5
+            )
             if k + 1 < len(shown):
-                axes.annotate("", xy=(left + wide - 0.006, 0.5), xytext=(left + wide - 0.03, 0.5), arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1})
+                axes.annotate(
+                    "",
+                    xy=(left + wide - 0.006, 0.5),
+                    xytext=(left + wide - 0.03, 0.5),
+                    arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1},
+                )
         ends = "field" if output == "flux_density" else "current"
         caption = (
             f"The chain from {ends} to reading. The percentage is the share of the misfit that the best single effect of the block could take, to first "
@@ -43,7 +50,9 @@ def block_map(where, found_in, output: str, stem: str = "blocks"):
 def _box(left, width, tint, line):
     from matplotlib.patches import FancyBboxPatch
 
-    return FancyBboxPatch((left, 0.1), width, 0.8, boxstyle="round,pad=0,rounding_size=0.012", mutation_aspect=7, fc=tint, ec=INK, lw=line)
+    return FancyBboxPatch(
+        (left, 0.1), width, 0.8, boxstyle="round,pad=0,rounding_size=0.012", mutation_aspect=7, fc=tint, ec=INK, lw=line
+    )
 
 
 def places(where, evidence, output: str, stem: str = "places"):
@@ -69,7 +78,7 @@ def places(where, evidence, output: str, stem: str = "places"):
                 axes.set_ylabel(f"misfit, rms / {unit}")
         axes = figure.add_axes([0.74, 0.2, 0.24, 0.7])
         rows = where["by_period"]
-        for k, row in enumerate(rows):
+        for row in rows:
             axes.plot(np.arange(1, len(row) + 1), fine * np.asarray(row), marker="o", ms=2.5, lw=0.8, color=BLUE, alpha=0.7)
         axes.axhline(fine * float(np.median(evidence["noise"])), color=INK, lw=1, ls=(0, (4, 2)))
         top = max((max(r) for r in rows), default=1.0)
@@ -102,7 +111,14 @@ def ranking(candidates, stem: str = "ranking", count: int = 16):
         axes.set_xticks(ticks, [str(t) for t in ticks])
         for k, c in enumerate(rows):
             if c["achieved_chi2_drop"] is not None:
-                axes.text(1.01, k, f"χ² fell by {plain(c['achieved_chi2_drop'])}", transform=axes.get_yaxis_transform(), va="center", fontsize=7.5)
+                axes.text(
+                    1.01,
+                    k,
+                    f"χ² fell by {plain(c['achieved_chi2_drop'])}",
+                    transform=axes.get_yaxis_transform(),
+                    va="center",
+                    fontsize=7.5,
+                )
         axes.set_yticks(range(len(rows)), [c["name"].replace("_", " ") for c in rows])
         axes.set_ylim(-0.6, len(rows) - 0.4)
         axes.set_xlabel("score |z|, standard deviations")

@@ -27,7 +27,11 @@ def loops(evidence, output: str, drive: str, after=None, stem: str = "loops"):
     what = "fitted" if after is None else "simulated before and after the repair"
     title = f"Measured and {what} loops"
     total = len(names)
-    some = "" if len(panels) == total else f" {len(panels)} of {total} recordings are shown: the worst, and others over the frequencies."
+    some = (
+        ""
+        if len(panels) == total
+        else f" {len(panels)} of {total} recordings are shown: the worst, and others over the frequencies."
+    )
     worst = int(np.argmax(evidence["chi2"]))
     detail = f"The worst recording is {names[worst]} with χ²/N {plain(evidence['chi2'][worst])}."
     caption = (
@@ -90,8 +94,17 @@ def _panels(panels, output, drive, stem, title, caption, detail):
 def _loop(axes, loop, drive_factor, factor, heading):
     drive = drive_factor * loop["drive"]
     close = lambda x: np.append(x, x[0])
-    axes.plot(close(drive), factor * close(loop["measured"]), color=SKY, lw=3.2, alpha=0.75, solid_capstyle="round", label="measured")
-    axes.plot(close(drive), factor * close(loop["model"]), color=MODEL, lw=1.0, ls=(0, (4, 1.6)), label="before" if "after" in loop else "fitted")
+    axes.plot(
+        close(drive), factor * close(loop["measured"]), color=SKY, lw=3.2, alpha=0.75, solid_capstyle="round", label="measured"
+    )
+    axes.plot(
+        close(drive),
+        factor * close(loop["model"]),
+        color=MODEL,
+        lw=1.0,
+        ls=(0, (4, 1.6)),
+        label="before" if "after" in loop else "fitted",
+    )
     if "after" in loop:
         axes.plot(close(drive), factor * close(loop["after"]), color=INK, lw=0.8, label="after")
     axes.set_title(heading, loc="left", linespacing=1.3)
@@ -166,12 +179,16 @@ def inside(evidence, drive: str, stem: str = "inside"):
                 if row == "H":
                     axes.set_title(f"{evidence['name'][int(key)]}, {plain(evidence['frequency'][int(key)])} Hz", loc="left")
                 y -= gap if row != "M" else 0.55
-        words = "the current I that is applied and I₁ = (H − H_bias)/c₀, which is left of it for the field; " if with_current else ""
+        words = (
+            "the current I that is applied and I₁ = (H − H_bias)/c₀, which is left of it for the field; " if with_current else ""
+        )
         caption = (
             f"Signals that no instrument reads, as the fitted model has them: the field that is applied and the field H in the rod; {words}"
             "the magnetization M; and M against H."
         )
-        return picture(figure, stem, "Signals inside the model: H, I₁ and M" if with_current else "Signals inside the model: H and M", caption)
+        return picture(
+            figure, stem, "Signals inside the model: H, I₁ and M" if with_current else "Signals inside the model: H and M", caption
+        )
 
 
 def _inside_row(axes, row, signals, drive, first):
@@ -195,7 +212,7 @@ def _inside_row(axes, row, signals, drive, first):
         label = f"M / ({magnet_unit})"
         axes.set_xlabel(f"H / ({unit})")
     if row in ("H", "I_1") and first:
-        axes.legend(loc="upper right", ncols=2, handlelength=1.2, borderaxespad=0)
+        axes.legend(loc="best", handlelength=1.2, borderaxespad=0)
     if first:
         axes.set_ylabel(label)
     if row == "M":
@@ -218,13 +235,24 @@ def periods(entries, output: str, stem: str = "periods"):
             axes = figure.add_axes([(column + 0.19) / columns, 1 - (row + 0.80) / rows, 0.76 / columns, 0.62 / rows])
             for i, (number, reading) in enumerate(zip(entry["number"], entry["reading"], strict=True)):
                 phase = np.arange(len(reading)) / len(reading)
-                axes.plot(phase, factor * reading, color=colours[i], lw=[2.4, 1.4, 0.8][i], ls=["-", (0, (4, 2)), "-"][i], label=f"period {number}")
-            axes.set_title(f"{entry['name']}" + (f", {plain(float(entry['frequency']))} Hz" if entry["frequency"] else ""), loc="left")
+                axes.plot(
+                    phase,
+                    factor * reading,
+                    color=colours[i],
+                    lw=[2.4, 1.4, 0.8][i],
+                    ls=["-", (0, (4, 2)), "-"][i],
+                    label=f"period {number}",
+                )
+            axes.set_title(
+                f"{entry['name']}" + (f", {plain(float(entry['frequency']))} Hz" if entry["frequency"] else ""), loc="left"
+            )
             axes.set_xlim(0, 1)
             axes.set_xlabel("part of the period")
             if column == 0:
                 axes.set_ylabel(label)
             if k == 0:
                 axes.legend(loc="best")
-        caption = "The readings as recorded, the first and the last two periods over each other; settled and sound recordings repeat."
+        caption = (
+            "The readings as recorded, the first and the last two periods over each other; settled and sound recordings repeat."
+        )
         return picture(figure, stem, "The recordings as they are", caption)

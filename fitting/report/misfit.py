@@ -3,7 +3,24 @@ autocorrelation, spectrum, and how the objective fell."""
 
 import numpy as np
 
-from .style import BLUE, GREEN, INK, MEASURED, MODEL, MUTED, ORANGE, PALE, SEQUENTIAL, SKY, VERMILION, canvas, picture, plain, scale_of, styled
+from .style import (
+    BLUE,
+    GREEN,
+    INK,
+    MEASURED,
+    MODEL,
+    MUTED,
+    ORANGE,
+    PALE,
+    SEQUENTIAL,
+    SKY,
+    VERMILION,
+    canvas,
+    picture,
+    plain,
+    scale_of,
+    styled,
+)
 
 WIDTH = 10.0
 MARKERS = "os^Dv<>P"
@@ -75,7 +92,12 @@ def against(evidence, stem: str = "against"):
         # a recording has about 81 numbers: five standard deviations of chi2/N
         axes[2].axhspan(max(1 - 3 * np.sqrt(2 / 81), 0.3), 1 + 3 * np.sqrt(2 / 81), color=PALE, lw=0)
         axes[2].plot(frequency, np.maximum(chi2, 1e-3), ls="", marker="o", ms=5, mfc="none", mec=VERMILION, mew=1.4)
-        axes[2].set(xscale="log", xlabel="frequency / Hz", title="χ²/N of each recording", ylim=(min(0.4, chi2.min() / 1.3), max(3.0, chi2.max() * 1.4)))
+        axes[2].set(
+            xscale="log",
+            xlabel="frequency / Hz",
+            title="χ²/N of each recording",
+            ylim=(min(0.4, chi2.min() / 1.3), max(3.0, chi2.max() * 1.4)),
+        )
         axes[2].set_yscale("log")
         plain_ticks(axes[2], "xy")
         axes[0].set_title("against the applied field")
@@ -97,7 +119,17 @@ def _branches(axes, found, key):
     axes.axhline(0, color=MUTED, lw=0.5)
     for name, colour, marker in (("rising", BLUE, "o"), ("falling", VERMILION, "s")):
         mean, error = found[name][:2]
-        axes.errorbar(scale * middle, mean, 2 * error, color=colour, marker=marker, ms=3, lw=1, mfc="white" if name == "falling" else colour, label=name)
+        axes.errorbar(
+            scale * middle,
+            mean,
+            2 * error,
+            color=colour,
+            marker=marker,
+            ms=3,
+            lw=1,
+            mfc="white" if name == "falling" else colour,
+            label=name,
+        )
     if key == "rate":
         axes.set_xscale("log")
         axes.set_xlabel("|dH/dt| applied / (A/m/s)")
@@ -155,7 +187,9 @@ def spectrum(evidence, output: str, stem: str = "spectrum"):
             between = lines["between"][key]
             axes.plot(between["order"], fine * between["amplitude"], color=PALE, lw=1.0, label="between harmonics")
             axes.plot(order, fine * lines["floor"][k], color=INK, lw=1.1, label="noise of a harmonic")
-            axes.plot(order[1:], fine * lines["measured"][k, 1:], ls="", marker="o", ms=3.6, mfc="none", mec=MEASURED, label="measured")
+            axes.plot(
+                order[1:], fine * lines["measured"][k, 1:], ls="", marker="o", ms=3.6, mfc="none", mec=MEASURED, label="measured"
+            )
             axes.plot(order, fine * lines["misfit"][k], ls="", marker="D", ms=3.0, color=MODEL, mew=0, label="misfit")
             axes.set(yscale="log", xlim=(-0.5, order[-1] + 0.5), ylim=(lowest, highest), xlabel="harmonic of the drive")
             axes.set_title(f"{evidence['name'][k]}, {plain(evidence['frequency'][k], 4)} Hz", loc="left")

@@ -41,7 +41,8 @@ def _panel(figure, left, values, lower, seen, levels, unit, label, title):
     axes = figure.add_axes([left, 0.12, 0.335, 0.335 * 10 / 4.3])
     shown = np.ma.masked_where(~seen, values)
     extent = (levels[0], levels[-1], levels[0], levels[-1])
-    filled = values[seen & (values > 0)]
+    # on the diagonal stands what has no hysteresis, as much as all the rest
+    filled = values[seen & (values > 0) & ~np.eye(len(values), dtype=bool)]
     top = float(np.quantile(filled, 0.995)) if len(filled) else 1.0
     drawn = axes.imshow(shown, origin="lower", extent=extent, cmap=SEQUENTIAL, norm=PowerNorm(0.5, 0, top), interpolation="nearest")
     unseen = lower & ~seen

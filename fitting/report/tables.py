@@ -27,8 +27,15 @@ def flags(p) -> str:
     return ", ".join(text for text, on in said if on) or ("ok" if p["free"] else "")
 
 
-def parameters(fit, valid: bool, caption: str = "Fitted parameters") -> list[dict]:
-    """Two tables: fitted parameters with errors and flags, and those held fixed."""
+DOUBTS = {
+    "": "",
+    "not valid": "Standard errors assume that only noise is left. It is not, so the true errors are larger by an unknown amount.",
+    "too narrow": "Standard errors assume that only noise is left. A little more is, so the true errors are somewhat larger.",
+}
+
+
+def parameters(fit, doubt: str = "", caption: str = "Fitted parameters") -> list[dict]:
+    """Two tables: fitted parameters with errors and flags, and those held fixed; `doubt`: a key of DOUBTS."""
     free, fixed = [], []
     for name, p in fit["parameters"].items():
         if not p["free"]:
@@ -36,13 +43,29 @@ def parameters(fit, valid: bool, caption: str = "Fitted parameters") -> list[dic
             continue
         spread = 1.96 * p["stderr"]
         interval = f"{to_error(p['value'] - spread, p['stderr'])} to {to_error(p['value'] + spread, p['stderr'])}"
-        row = [name, p.get("meaning", ""), plain(p.get("start"), 5), to_error(p["value"], p["stderr"]), plain(p["stderr"], 2), interval, unit_text(p["unit"]), flags(p)]
+        row = [
+            name,
+            p.get("meaning", ""),
+            plain(p.get("start"), 5),
+            to_error(p["value"], p["stderr"]),
+            plain(p["stderr"], 2),
+            interval,
+            unit_text(p["unit"]),
+            flags(p),
+        ]
         free.append(row)
-    error, interval = ("std. error", "95 % interval") if valid else ("std. error (not valid)", "95 % interval (not valid)")
-    note = "" if valid else "Standard errors assume that only noise is left. It is not, so the true errors are larger by an unknown amount."
+    error, interval = (f"{name} ({doubt})" if doubt else name for name in ("std. error", "95 % interval"))
     tables = []
     if free:
-        tables.append(table(caption, ["parameter", "meaning", "start", "value", error, interval, "unit", "flags"], free, note, code=True))
+        tables.append(
+            table(
+                caption,
+                ["parameter", "meaning", "start", "value", error, interval, "unit", "flags"],
+                free,
+                DOUBTS[doubt],
+                code=True,
+            )
+        )
     if fixed:
         tables.append(table("Held at the bench file's values", ["parameter", "meaning", "value", "unit"], fixed, code=True))
     return tables
@@ -62,7 +85,11 @@ def correlations(fit) -> dict | None:
             strong = a != b and value is not None and abs(value) > 0.9
             row.append("" if value is None else f"{value:.2f}".replace("-", "−") + (" strong" if strong else ""))
         rows.append(row)
-    note = "“strong” marks pairs beyond 0.9: their values move together, and neither is known as well alone." if any("strong" in c for r in rows for c in r) else ""
+    note = (
+        "“strong” marks pairs beyond 0.9: their values move together, and neither is known as well alone."
+        if any("strong" in c for r in rows for c in r)
+        else ""
+    )
     return table("Correlations of the fitted constants", ["", *names], rows, note, code=True)
 
 
@@ -73,7 +100,10 @@ def recordings(fit) -> dict:
         fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
         rows.append([Path(r["file"]).name, plain(r["frequency"], 4), r["periods"], f"{plain(fine * r['noise_rms'])} {unit}",
                      f"{plain(fine * r['residual_rms'])} {unit}", plain(r["chi2_per_sample"]), r["sha256"][:12]])  # fmt: skip
-    return table("Noise and misfit of each recording", ["recording", "frequency / Hz", "periods", "noise rms", "residual rms", "χ²/N", "sha256 begins"], rows, code=True)
+    head = ["recording", "frequency / Hz", "periods", "noise rms", "residual rms", "χ²/N", "sha256 begins"]
+    if not any(row[-1] for row in rows):  # recordings that were never files
+        head, rows = head[:-1], [row[:-1] for row in rows]
+    return table("Noise and misfit of each recording", head, rows, code=True)
 
 
 def checks(rows, repaired: bool = True) -> dict:
@@ -83,7 +113,15 @@ def checks(rows, repaired: bool = True) -> dict:
         fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
         keys = ("rms_before", "rms_after") if repaired else ("rms_after",)
         beyond = [(max(r[k] ** 2 - r["noise_rms"] ** 2, 0.0)) ** 0.5 for k in keys]
-        body.append([Path(r["file"]).name, *(plain(fine * r[k]) for k in keys), plain(fine * r["noise_rms"]), *(plain(fine * b) for b in beyond), unit])
+        body.append(
+            [
+                Path(r["file"]).name,
+                *(plain(fine * r[k]) for k in keys),
+                plain(fine * r["noise_rms"]),
+                *(plain(fine * b) for b in beyond),
+                unit,
+            ]
+        )
     when = (" before", " after") if repaired else ("",)
     head = ["recording", *(f"rms error{w}" for w in when), "noise rms", *(f"beyond noise{w}" for w in when), "unit"]
     note = "Beyond noise: the root of what the squared error exceeds the squared noise by."
@@ -97,21 +135,36 @@ def intervals(fit) -> list[dict]:
     if boot:
         rows = [[n, to_error(p["low"], p["deviation"]), to_error(p["high"], p["deviation"]), plain(p["deviation"], 2), plain(p["stderr"], 2),
                  unit_text(p["unit"])] for n, p in boot["parameters"].items()]  # fmt: skip
-        caption = f"Bootstrap ({boot['kind']}), {boot['settled']} of {boot['draws']} draws settled: {100 * boot['level']:g} % intervals"
-        made.append(table(caption, ["parameter", "from", "to", "deviation of the draws", "std. error of the fit", "unit"], rows, code=True))
+        caption = (
+            f"Bootstrap ({boot['kind']}), {boot['settled']} of {boot['draws']} draws settled: {100 * boot['level']:g} % intervals"
+        )
+        made.append(
+            table(caption, ["parameter", "from", "to", "deviation of the draws", "std. error of the fit", "unit"], rows, code=True)
+        )
     if profile:
         rows = [[n, to_error(p["low"], p["stderr"]) + ("" if p["low_found"] else " (not closed)"),
                  to_error(p["high"], p["stderr"]) + ("" if p["high_found"] else " (not closed)"), unit_text(p["unit"])]
                 for n, p in profile["parameters"].items()]  # fmt: skip
-        made.append(table(f"Profile likelihood: {100 * profile['level']:g} % intervals", ["parameter", "from", "to", "unit"], rows, code=True))
+        made.append(
+            table(
+                f"Profile likelihood: {100 * profile['level']:g} % intervals", ["parameter", "from", "to", "unit"], rows, code=True
+            )
+        )
     return made
 
 
 def numbers(fit) -> dict:
     """Size and cost of the fit."""
-    rows = [["χ²/N", plain(fit["chi2_per_sample"], 4)], ["numbers met (real and imaginary parts of harmonics)", fit.get("data_count", "")]]
+    rows = [
+        ["χ²/N", plain(fit["chi2_per_sample"], 4)],
+        ["numbers met (real and imaginary parts of harmonics)", fit.get("data_count", "")],
+    ]
     if fit.get("effective_unknowns") is not None:
         rows.append(["effective unknowns", plain(fit["effective_unknowns"], 3)])
-    rows += [["level L of the plane, edges included", fit["levels"]], ["BIC", plain(fit["bic"], 6)], ["Jacobians", fit["jacobians"]]]
+    rows += [
+        ["level L of the plane, edges included", fit["levels"]],
+        ["BIC", plain(fit["bic"], 6)],
+        ["Jacobians", fit["jacobians"]],
+    ]
     rows += [["compilation / s", plain(fit["compile_s"], 2)], ["iteration / s", plain(fit["solve_s"], 2)]]
     return table("Size and cost of the fit", ["quantity", "value"], rows)

@@ -61,7 +61,16 @@ def diagnoses(runs, bench, fitted, poor):
     recordings, _ = runs
     ranked = candidates()
     names = [c.name for c in ranked[:2]]
-    check = ({"file": "check_150Hz.csv", "channel": "displacement", "unit": "m", "rms_before": 3e-7, "rms_after": 5e-8, "noise_rms": 4e-8},)
+    check = (
+        {
+            "file": "check_150Hz.csv",
+            "channel": "displacement",
+            "unit": "m",
+            "rms_before": 3e-7,
+            "rms_after": 5e-8,
+            "noise_rms": 4e-8,
+        },
+    )
     common = {
         "candidates": ranked, "floors": {"noise_rms": 4e-8, "solver_rms": 1e-10, "density_rms": 2e-9},
         "where": where(poor, ranked, recordings, "displacement"), "check": check, "base": poor,
@@ -70,13 +79,27 @@ def diagnoses(runs, bench, fitted, poor):
         "name": names[0], "block": ranked[0].block, "parameters": {"tau": {"value": 1.23e-4, "stderr": 2e-6, "unit": "s"}}, "confidence": 0.97,
         "shifts": {"coil.R_eddy": [80.0, 62.0], "mechanics.xi": [0.9, 0.81]},
     }  # fmt: skip
-    ask = {"text": "four settled periods of 0.8 A at 500 Hz", "drive": {}, "channels": ["the coil current by a shunt"], "separates": [[*names, 0.97]]}
+    ask = {
+        "text": "four settled periods of 0.8 A at 500 Hz",
+        "drive": {},
+        "channels": ["the coil current by a shunt"],
+        "separates": [[*names, 0.97]],
+    }
     return {
-        "attributed": Diagnosis("attributed", f"{names[0]} (source) was left out.", (effect,), repaired=fitted, absorbed=(ranked[-1].name,), **common),
+        "attributed": Diagnosis(
+            "attributed", f"{names[0]} (source) was left out.", (effect,), repaired=fitted, absorbed=(ranked[-1].name,), **common
+        ),
         "group": Diagnosis("group", "cannot tell apart.", (), (tuple(names),), next_experiment=ask, repaired=fitted, **common),
-        "unknown_at": Diagnosis("unknown_at", "unknown.", unknown={"block": "sensor", "region": "field quarter 1 of 4", "explained_share": 0.2}, **common),
+        "unknown_at": Diagnosis(
+            "unknown_at",
+            "unknown.",
+            unknown={"block": "sensor", "region": "field quarter 1 of 4", "explained_share": 0.2},
+            **common,
+        ),
         "nothing_missing": Diagnosis("nothing_missing", "nothing is missing.", **{**common, "base": fitted}),
-        "data_problem": Diagnosis("data_problem", "rec_010Hz.csv: an unsettled transient.", data_problem="an unsettled transient", base=fitted),
+        "data_problem": Diagnosis(
+            "data_problem", "rec_010Hz.csv: an unsettled transient.", data_problem="an unsettled transient", base=fitted
+        ),
         "unreadable": Diagnosis("data_problem", "rec.csv: displacement is clipped.", data_problem="clipped"),
     }
 
@@ -94,7 +117,9 @@ def folders(tmp_path_factory, runs, fitted, poor, diagnoses):
             write_fit(folder, result, recordings, content, "magjax fit rec_*.csv --bench aa-050h --out result")
         else:
             known = recordings if kind != "unreadable" else []
-            write_diagnosis(folder, result, known, content, "magjax diagnose rec_*.csv --bench aa-050h", checks if result.check else ())
+            write_diagnosis(
+                folder, result, known, content, "magjax diagnose rec_*.csv --bench aa-050h", checks if result.check else ()
+            )
     return made
 
 

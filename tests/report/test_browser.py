@@ -7,7 +7,9 @@ import pytest
 from .conftest import KINDS
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install magjax[browser]")
-CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")) if p), None)
+CHROMIUM = next(
+    (p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")) if p), None
+)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the PATH")
 
 

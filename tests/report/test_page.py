@@ -94,7 +94,16 @@ def test_every_figure_and_table_has_words(html, kind):
     assert all(e[2].strip() and "scope" in e[1] for e in outline.all("th"))
     captions = [e[2] for e in outline.all("caption")]
     assert len(captions) == len(set(captions))
-    expected = {"fit": 10, "poor": 10, "attributed": 12, "group": 12, "unknown_at": 10, "nothing_missing": 10, "data_problem": 1, "unreadable": 0}
+    expected = {
+        "fit": 10,
+        "poor": 10,
+        "attributed": 12,
+        "group": 12,
+        "unknown_at": 10,
+        "nothing_missing": 10,
+        "data_problem": 1,
+        "unreadable": 0,
+    }
     assert len(outline.all("svg")) >= expected[kind]
 
 
@@ -144,12 +153,13 @@ def test_the_banner_of_a_fit(folders):
     assert "the error bars hold" in good and 'class="banner good"' in good and "not valid" not in good
     assert 'class="banner bad"' in bad and "std. error (not valid)" in bad
     fit = json.loads((folders["fit"] / "fit.json").read_text())
-    assert validity(fit)[3] is True
-    tone, said, advice, valid = validity({**fit, "chi2_per_sample": 9.0})
-    assert tone == "bad" and "3 times the noise" in said and "diagnosis" in advice and not valid
+    assert validity(fit)[3] == ""
+    tone, said, advice, doubt = validity({**fit, "chi2_per_sample": 9.0})
+    assert tone == "bad" and "3 times the noise" in said and "diagnosis" in advice and doubt == "not valid"
     assert validity({**fit, "chi2_per_sample": float("nan")})[0] == "bad"
     assert validity({**fit, "converged": False})[0] == "bad"
-    assert validity({**fit, "chi2_per_sample": 1.4})[0] == "warn"
+    assert validity({**fit, "chi2_per_sample": 1.4})[0::3] == ("warn", "too narrow")
+    assert "assumed" in validity({**fit, "chi2_per_sample": 0.2})[1]
     bound = {**fit["parameters"], "mechanics.xi": {**fit["parameters"]["mechanics.xi"], "at_bound": True}}
     assert "mechanics.xi" in validity({**fit, "parameters": bound})[1]
     loose = {**fit["parameters"], "mechanics.xi": {**fit["parameters"]["mechanics.xi"], "identified": False}}
@@ -176,8 +186,17 @@ def test_the_verdict_comes_first_and_in_plain_words(folders, diagnoses):
 def test_a_diagnosis_shows_its_grounds(folders):
     page = (folders["attributed"] / "report.html").read_text(encoding="utf-8")
     heads = [e[2] for e in Outline(page).all("h2")]
-    assert heads.index("What was left out") < heads.index("Check recordings, before and after") < heads.index("The catalogue against the misfit")
-    for title in ("Where simulation and recordings differ", "Fitted recordings, before and after", "Parameter shifts", "Placebo: would the search cry wolf?"):
+    assert (
+        heads.index("What was left out")
+        < heads.index("Check recordings, before and after")
+        < heads.index("The catalogue against the misfit")
+    )
+    for title in (
+        "Where simulation and recordings differ",
+        "Fitted recordings, before and after",
+        "Parameter shifts",
+        "Placebo: would the search cry wolf?",
+    ):
         assert title in heads
     assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
     group = (folders["group"] / "report.html").read_text(encoding="utf-8")
@@ -204,7 +223,10 @@ def test_the_placebo_panel():
 
 def test_messages_read_as_sentences():
     assert sentence("rec_1.csv: it drifts") == "rec_1.csv: it drifts."
-    assert sentence("excess loss: chi2/N falls. check: 4.81e-08 -> 4.6e-08 m; 1e-3 m") == "Excess loss: χ²/N falls. check: 48.1 → 46 nm; 1e-3 m."
+    assert (
+        sentence("excess loss: chi2/N falls. check: 4.81e-08 -> 4.6e-08 m; 1e-3 m")
+        == "Excess loss: χ²/N falls. check: 48.1 → 46 nm; 1e-3 m."
+    )
     assert sentence("") == ""
 
 

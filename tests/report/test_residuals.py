@@ -13,7 +13,12 @@ def spectrum(frequency=50.0, periods=4, per=1000, rng=None):
     rng = rng or np.random.default_rng(0)
     samples = periods * per
     return types.SimpleNamespace(
-        frequency=frequency, periods=periods, samples=samples, dt=1 / (frequency * per), residue=rng.standard_normal(samples), noise_rms=1.0
+        frequency=frequency,
+        periods=periods,
+        samples=samples,
+        dt=1 / (frequency * per),
+        residue=rng.standard_normal(samples),
+        noise_rms=1.0,
     )
 
 
@@ -62,5 +67,12 @@ def test_folding_keeps_the_phase():
 
 
 def test_the_history_is_cut_into_stages():
-    steps = [("fit", 1, 9.0), ("fit", 2, 3.0), ("fit", 1, 8.0), ("finer density", 1, 2.0), ("trying creep", 0, None), ("finer density", 2, 1.0)]
+    steps = [
+        ("fit", 1, 9.0),
+        ("fit", 2, 3.0),
+        ("fit", 1, 8.0),
+        ("finer density", 1, 2.0),
+        ("trying creep", 0, None),
+        ("finer density", 2, 1.0),
+    ]
     assert stages_of(steps) == [("fit", [9.0, 3.0]), ("fit (2)", [8.0]), ("finer density", [2.0, 1.0])]

@@ -12,13 +12,22 @@ from fitting.report.tables import correlations, to_error
 
 
 def test_numbers_as_people_write_them():
-    assert [plain(v) for v in (0, 0.5, -12345.6, 7.87e5, -2.83e-5, None, float("nan"))] == ["0", "0.5", "−12300", "7.87e5", "−2.83e−5", "–", "–"]
+    assert [plain(v) for v in (0, 0.5, -12345.6, 7.87e5, -2.83e-5, None, float("nan"))] == [
+        "0",
+        "0.5",
+        "−12300",
+        "7.87e5",
+        "−2.83e−5",
+        "–",
+        "–",
+    ]
     assert plain(100000.0) == "1e5" and plain(float("inf")) == "∞"
     assert [percent(s) for s in (0, 0.004, 0.25, 0.995, 1.0, float("nan"))] == ["0 %", "< 1 %", "25 %", "> 99 %", "100 %", "–"]
 
 
 @pytest.mark.parametrize(
-    ("value", "error", "text"), [(61.98871, 0.0652, "61.989"), (404.857, 2.4, "404.9"), (0.8096, 0.3, "0.81"), (5.0, 0.0, "5"), (0.001, 2.0, "0.001")]
+    ("value", "error", "text"),
+    [(61.98871, 0.0652, "61.989"), (404.857, 2.4, "404.9"), (0.8096, 0.3, "0.81"), (5.0, 0.0, "5"), (0.001, 2.0, "0.001")],
 )
 def test_values_to_the_second_digit_of_their_error(value, error, text):
     assert to_error(value, error) == text
@@ -70,7 +79,7 @@ def test_svg_has_text_name_and_description():
         svg = to_svg(figure, "stem", 'a "title" & more', "what < is seen")
         again = to_svg(figure, "stem", 'a "title" & more', "what < is seen")
     assert svg == again
-    assert '>5 &lt; 6 &amp; so on</text>' in svg and "0.00125" not in svg.split("<text")[0]
+    assert ">5 &lt; 6 &amp; so on</text>" in svg and "0.00125" not in svg.split("<text")[0]
     assert 'role="img" aria-label="a &quot;title&quot; &amp; more" aria-describedby="stem-desc"' in svg
     assert '<desc id="stem-desc">what &lt; is seen</desc>' in svg and "<metadata" not in svg
     labels = re.findall(r">([^<>]+)</text>", svg)
