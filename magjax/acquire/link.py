@@ -99,7 +99,13 @@ def ask_hello(port, wait: float, splitter=None) -> p.Hello:
                 return p.read_hello(payload)
             if p.whole(payload) and payload[0] == p.ACK and payload[2] == p.QUERY:
                 raise DeviceError(f"the device refuses the handshake: {p.read_ack(payload).text}; load the matching firmware")
-    heard = f"{splitter.received} bytes came, none of them a frame of the protocol" if splitter.received else "nothing came"
+    heard = (
+        f"{splitter.received} bytes came, none of them a frame of the protocol"
+        if splitter.received
+        else "nothing came; another host may hold the line"
+        if "://" in port.name
+        else "nothing came"
+    )
     raise DeviceError(
         f"{port.name}: no HELLO within {wait:g} s ({heard}); check the port, the baud rate and the firmware (docs/protocol.md)"
     )

@@ -89,26 +89,26 @@ def hold_signals(hold: bool) -> None:
 
 
 class Forward:
-    """While it lasts, Ctrl-C is passed on to a recorder instead of interrupting this process at some odd place."""
+    """While it lasts, Ctrl-C (or SIGTERM) is passed on to a recorder instead of ending this process at some odd place."""
 
     def __init__(self, child):
-        self.child, self.before, self.count = child, None, 0
+        self.child, self.before, self.count = child, {}, 0
 
     def __enter__(self):
         if threading.current_thread() is threading.main_thread():
-            self.before = signal.signal(signal.SIGINT, self.forward)
+            self.before = {number: signal.signal(number, self.forward) for number in (signal.SIGINT, signal.SIGTERM)}
         hold_signals(False)
 
-    def forward(self, *_):
+    def forward(self, number, _frame):
         """Pass it on; who asks for the fifth time does not want to wait for an order that does not come."""
         self.count += 1
         if self.count > 4:
             raise KeyboardInterrupt
-        self.child.send_signal(signal.SIGINT)
+        self.child.send_signal(number)
 
     def __exit__(self, *_):
-        if self.before is not None:
-            signal.signal(signal.SIGINT, self.before)
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
 
 
 def record(order: Order, progress=None) -> dict:

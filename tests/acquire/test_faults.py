@@ -185,6 +185,32 @@ def test_ctrl_c_stops_in_order(emulate, order):
     assert drive_at_zero(port)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("seconds", [0.3, 0.8, 1.5, None])
+def test_ctrl_c_at_odd_moments(emulate, tmp_path, seconds, number):
+    """To the command line alone: while it imports, while the recorder starts, while it records."""
+    device = emulate()
+    path = tmp_path / "run.mjlog"
+    command = [sys.executable, "-m", "magjax", "record", device["port"], "--out", str(path), "--periods", "0"]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    if seconds is None:
+        until(lambda: path.exists() and path.stat().st_size > 20_000)
+    else:
+        time.sleep(seconds)
+    if number == signal.SIGTERM and not path.exists():
+        child.kill()  # before it records there is nothing to end in order
+        child.communicate()
+        return
+    child.send_signal(number)
+    out, err = child.communicate(timeout=60)
+    assert child.returncode == 130 and "Traceback" not in out + err and "Exception" not in err, err
+    assert seconds is not None or ("interrupted" in err or "asked to end" in err) and "drive at zero: confirmed" in err
+    assert drive_at_zero(device["port"])
+    if path.exists():
+        log = Log(path)
+        assert log.end["drive_at_zero"] == "confirmed" and not log.damage
+
+
 def test_the_duration_limit_ends_it(emulate, order):
     port = emulate()["port"]
     end = record(order(port, samples=0, max_s=0.6))
