@@ -14,7 +14,7 @@ from collections import Counter, deque
 from concurrent.futures.process import BrokenProcessPool
 
 from ..errors import ConfigurationError
-from .worker import begin, pack, perform_opened, perform_packed
+from .worker import begin, one_thread, pack, perform_opened, perform_packed
 
 TRIES = 3  # workers that one chunk may cost
 PATIENCE = 10.0  # s, for a dask scheduler to answer
@@ -56,7 +56,9 @@ class InProcess:
         from .job import perform
 
         for chunk, item, entropy in tasks:
-            yield chunk, perform(work, inputs, item, entropy)
+            with one_thread():
+                result = perform(work, inputs, item, entropy)
+            yield chunk, result
 
 
 class _Worker:
@@ -151,6 +153,7 @@ class Foreign:
         """See the module."""
         blob = pack(inputs)
         key = hashlib.sha256(blob).hexdigest()
+        limits = one_thread()  # where the workers are threads of this process
         running = {self.executor.submit(perform_packed, work, key, blob, item, entropy): chunk for chunk, item, entropy in tasks}
         try:
             for future in concurrent.futures.as_completed(running):
@@ -163,6 +166,7 @@ class Foreign:
         finally:
             for future in running:
                 future.cancel()
+            limits.restore_original_limits()
 
 
 class Dask:

@@ -108,5 +108,5 @@ def run_job(job: Job, executor=None, *, checkpoint=None, progress=None) -> Outco
 
 
 def perform(work, inputs, item, entropy):
-    """One chunk, wherever it runs: the encoded result."""
+    """One chunk, wherever it runs: the encoded result. BLAS must have one thread meanwhile (`worker.one_thread`)."""
     return encode(work(inputs, item, np.random.default_rng(np.random.SeedSequence(entropy))))

@@ -1,6 +1,7 @@
 """What runs inside a worker: JAX set up as in the process that asked, inputs unpickled once, a chunk at a time.
 
-JAX must be in double precision before the inputs are unpickled: arrays would lose half their digits on the way in.
+BLAS gets one thread: it sums in another order with every number of threads, and workers would crowd each other's cores;
+XLA's own threads leave the sums alone. JAX must be in double precision before the inputs are unpickled: arrays would lose half their digits on the way in.
 """
 
 import os
@@ -8,11 +9,16 @@ import pickle
 import signal
 import sys
 import threading
+import uuid
 
+import threadpoolctl
+
+BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
 SETTINGS = (
     "jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_default_matmul_precision", "jax_platforms",
 )  # fmt: skip
 
+_TOKEN = uuid.uuid4().hex
 _opened: dict[str, object] = {}  # digest -> inputs of the job at hand; one at a time
 _guard = threading.Lock()
 
@@ -38,17 +44,35 @@ def take_over(found: dict) -> None:
             jax.config.update(name, value)
 
 
+def one_thread():
+    """One thread for the BLAS libraries of this process: from the call on, or as a context."""
+    return threadpoolctl.threadpool_limits(1, user_api="blas")
+
+
+def settle_in(found: dict) -> None:
+    """Make this process a worker for good: settings taken over, one thread for BLAS, be it loaded already or later."""
+    take_over(found)
+    os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
+    one_thread()
+
+
 def pack(inputs) -> bytes:
-    """Inputs with the settings that they need."""
-    return pickle.dumps((settings(), pickle.dumps(inputs)))
+    """Inputs with the settings that they need, and the process that packed them."""
+    return pickle.dumps((_home(), settings(), pickle.dumps(inputs)))
+
+
+def _home():
+    """This process among all."""
+    return _TOKEN, os.getpid()
 
 
 def open_inputs(name: str, blob: bytes):
     """The inputs of a job, unpickled when first asked for; `name`: digest of the blob."""
     with _guard:
         if name not in _opened:
-            found, content = pickle.loads(blob)
-            take_over(found)
+            home, found, content = pickle.loads(blob)
+            if home != _home():  # else a thread of the process that asked, which keeps its own settings
+                settle_in(found)
             _opened.clear()
             _opened[name] = pickle.loads(content)
         return _opened[name]

@@ -243,6 +243,38 @@ def test_workers_take_over_the_settings_of_jax(executor):
     assert found == {"dtype": "float64", "cache": jax.config.jax_compilation_cache_dir, "least": 0.3}
 
 
+THREADS = """
+import sys
+from magjax.scale import run_job
+from magjax.scale.codec import digest
+from tests.scale import works
+from tests.scale.test_jobs import job
+print(digest(run_job(job(works.products, count=1)).results))
+"""
+
+
+def test_the_numbers_do_not_depend_on_the_threads_of_blas():
+    run = {"capture_output": True, "text": True, "cwd": ROOT, "check": True}
+    ended = [subprocess.run([sys.executable, "-c", THREADS], env={**os.environ, "OPENBLAS_NUM_THREADS": n}, **run).stdout for n in "12"]
+    assert ended[0] == ended[1] and len(ended[0]) > 30
+
+
+def test_blas_has_its_threads_again_after_a_job():
+    import threadpoolctl
+
+    def threads():
+        return [p["num_threads"] for p in threadpoolctl.threadpool_info() if p["user_api"] == "blas"]
+
+    before = threadpoolctl.threadpool_limits(2, user_api="blas")
+    try:
+        with concurrent.futures.ThreadPoolExecutor(3) as pool:
+            inside = [r["threads"] for r in run_job(job(works.threads, count=6), pool).results]
+        assert set(threads()) == {2}
+    finally:
+        before.restore_original_limits()
+    assert all(set(row) == {1} for row in inside)
+
+
 def test_digests_tell_contents_apart():
     actuator = load_bench("aa-050h").actuator()
     assert digest(actuator) == digest(load_bench("aa-050h").actuator())

@@ -56,3 +56,17 @@ def precision(inputs, item, rng):
 
     least = jax.config.jax_persistent_cache_min_compile_time_secs
     return {"dtype": str(jax.numpy.asarray(0.1).dtype), "cache": jax.config.jax_compilation_cache_dir, "least": least}
+
+
+def products(inputs, item, rng):
+    """Sums that BLAS splits over its threads."""
+    a = rng.standard_normal((900, 500))
+    return {"product": a.T @ a, "inverse": np.linalg.inv(a[:500])}
+
+
+def threads(inputs, item, rng):
+    """Threads of BLAS while a chunk is at work."""
+    import threadpoolctl
+
+    time.sleep(0.02 * item)
+    return {"threads": [p["num_threads"] for p in threadpoolctl.threadpool_info() if p["user_api"] == "blas"]}
