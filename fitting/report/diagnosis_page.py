@@ -17,6 +17,10 @@ TONES = {
     "unknown_at": "warn",
     "data_problem": "bad",
 }
+RUN_PLACEBO = (
+    "To run it: simulate the model of this folder on the same drives (magjax simulate --model), add noise of the size in the table of "
+    "floors, and diagnose those recordings."
+)
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
 
@@ -38,7 +42,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
             "The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"), output)
         ),
         _checks(found, evidence, sketch, output, drive),
-        _where(found, base, sketch, output),
+        _where(found, facts, base, sketch, output),
         _ranking(found, facts, sketch),
         _loops(base, repaired, sketch, output, drive),
         _left(found, base, repaired, sketch, output),
@@ -172,14 +176,16 @@ def _loops(base, repaired, sketch, output, drive):
     return section(title, sketch(base, loops.loops, base, output, drive, repaired or None))
 
 
-def _where(found, base, sketch, output):
+def _where(found, facts, base, sketch, output):
     where = found["where"]
     if not where or not base:
         return None
-    blocks = {e["block"] for e in found["effects"]}
+    marks = {facts[n]["block"]: "a rival acts here" for g in found["groups"] for n in g if n in facts}
+    marks |= {e["block"]: "effect named here" for e in found["effects"]}
+    marks |= {found["unknown"]["block"]: "acts most like this"} if found["unknown"] else {}
     return section(
         "Where simulation and recordings differ",
-        sketch(where.get("by_block"), pictures.block_map, where, blocks, output),
+        sketch(where.get("by_block"), pictures.block_map, where, marks, output),
         *headed("Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base)),
         *headed("By branch, field and period", sketch(where.get("by_branch"), pictures.places, where, base, output)),
     )
@@ -296,7 +302,7 @@ def placebo_section(placebo, verdict):
             "Not run. The placebo simulates the repaired model on the same drives with fresh noise, runs the same search on those recordings, and "
             "counts how often it names something more, though nothing more is there."
         )
-        return section(title, part(text=text + " Diagnose the same files again with --placebo N for N such searches."))
+        return section(title, part(text=text), part(text=RUN_PLACEBO))
     number = next((int(placebo[k]) for k in ("runs", "searches", "count", "n", "trials") if k in placebo), 0)
     false = next((int(placebo[k]) for k in ("false_alarms", "named", "named_more", "alarms", "cried_wolf") if k in placebo), None)
     parts = []

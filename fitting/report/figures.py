@@ -22,7 +22,7 @@ def paper_loops(families, stem: str = "paper_loops"):
             axes.set(title=name, xlabel="current / A", ylim=(None, highest))
             if i == 0:
                 axes.set_ylabel("displacement / µm")
-                axes.legend(loc="upper left")
+        axes.legend(loc="upper left", ncols=2)  # the second range leaves room above its loops
         caption = "Displacement against current at seven frequencies for two ranges of current, with the paper's constants."
         return picture(figure, stem, "T&B's loops with their constants", caption)
 

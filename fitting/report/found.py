@@ -9,11 +9,11 @@ BLOCKS = ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sens
 THRESHOLD = 5.5  # of |z|, as the search uses it
 
 
-def block_map(where, found_in, output: str, stem: str = "blocks"):
-    """The chain of blocks, each shaded by the share of the misfit that its best effect could explain; `found_in`: blocks
-    of the effects that were named."""
+def block_map(where, marks, output: str, stem: str = "blocks"):
+    """The chain of blocks, each shaded by the share of the misfit that its best effect could explain; `marks`: block ->
+    what the verdict says of it."""
     shares = where["by_block"]
-    shown = [b for b in BLOCKS if b in shares or b in found_in]
+    shown = [b for b in BLOCKS if b in shares or b in marks]
     wide = 1.0 / max(len(shown), 1)
     with styled():
         figure = canvas(WIDTH, 1.45)
@@ -24,13 +24,11 @@ def block_map(where, found_in, output: str, stem: str = "blocks"):
             share = float(shares.get(block, 0.0))
             left = k * wide + 0.012
             tint = np.array([1.0, 1.0, 1.0]) * (1 - share) + np.array([0.90, 0.62, 0.0]) * share
-            named = block in found_in
+            named = block in marks
             axes.add_patch(_box(left, wide - 0.03, tint, 2.4 if named else 0.8))
             axes.text(left + 0.5 * (wide - 0.03), 0.70, block, ha="center", va="center", fontweight="bold" if named else "normal")
             axes.text(left + 0.5 * (wide - 0.03), 0.47, percent(share), ha="center", va="center", fontsize=11)
-            axes.text(
-                left + 0.5 * (wide - 0.03), 0.25, "effect named here" if named else "", ha="center", va="center", fontsize=7.5
-            )
+            axes.text(left + 0.5 * (wide - 0.03), 0.25, marks.get(block, ""), ha="center", va="center", fontsize=7.5)
             if k + 1 < len(shown):
                 axes.annotate(
                     "",
@@ -41,9 +39,9 @@ def block_map(where, found_in, output: str, stem: str = "blocks"):
         ends = "field" if output == "flux_density" else "current"
         caption = (
             f"The chain from {ends} to reading. The percentage is the share of the misfit that the best single effect of the block could take, to first "
-            "order; blocks overlap, so shares do not add up. A thick frame marks the block of what was named."
+            "order; blocks overlap, so shares do not add up. A thick frame marks the blocks of which the verdict speaks."
         )
-        words = ", ".join(f"{b} {percent(shares.get(b, 0.0))}" for b in shown)
+        words = ", ".join(f"{b} {percent(shares.get(b, 0.0))}" + (f" ({marks[b]})" if b in marks else "") for b in shown)
         return picture(figure, stem, "Block map: what each block could explain", caption, words)
 
 
