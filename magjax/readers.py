@@ -142,7 +142,7 @@ def _read_mat(path):
 
         try:
             content = loadmat(path, squeeze_me=True)
-        except MatReadError as error:
+        except (MatReadError, IndexError) as error:
             raise RecordingError(f"{path}: not a MATLAB file ({error}); save it again, or export it as CSV") from None
     table = {k: np.asarray(v, float).ravel() for k, v in content.items() if not k.startswith("__") and np.ndim(v) == 1}
     return table, {}
