@@ -38,9 +38,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         _groups(found, facts),
         _unknown(found),
         section("Next experiment", *_next(found)),
-        section(
-            "The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"), output)
-        ),
+        section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"))),
         _checks(found, evidence, sketch, output, drive),
         _where(found, facts, base, sketch, output),
         _ranking(found, facts, sketch),
@@ -138,11 +136,12 @@ def _unknown(found):
     if not unknown:
         return None
     rows = [["block it acts most like", unknown.get("block", "")], ["region", unknown.get("region", "")]]
-    rows += (
-        [["share of the excess that the nearest effect explains", percent(unknown["explained_share"])]]
-        if "explained_share" in unknown
-        else []
-    )
+    if "explained_share" in unknown:
+        rows.append(["share of the excess that the nearest effect explains", percent(unknown["explained_share"])])
+    more = {
+        k: v for k, v in unknown.items() if k not in ("block", "region", "explained_share") and isinstance(v, (str, int, float))
+    }
+    rows += [[words(k), _shown(v)] for k, v in more.items()]
     return section("What is known of it", part(table=tables.table("The unknown", ["question", "answer"], rows)))
 
 

@@ -205,19 +205,25 @@ def of_checks(before, after, recordings, bench) -> dict:
     return found
 
 
-def of_recordings(recordings, bench) -> dict:
+READINGS = ("displacement", "flux_density", "magnetization")
+
+
+def of_recordings(recordings) -> dict:
     """The readings as recorded, one row a period, for recordings that no model may judge yet."""
     found = {}
     for k, recording in enumerate(recordings[:SHOWN]):
-        values = np.asarray(recording.channels[bench.output], float)
-        blocks = recording.repeats(bench.output)
-        drive = recording.repeats(bench.drive)
+        output = next((c for c in READINGS if c in recording.channels), None)
+        if output is None:
+            continue
+        values = np.asarray(recording.channels[output], float)
+        blocks = recording.repeats(output)
+        drive = recording.repeats(recording.drive)
         if not len(blocks):
-            blocks, drive = values[None], np.asarray(recording.channels[bench.drive], float)[None]
+            blocks, drive = values[None], np.asarray(recording.channels[recording.drive], float)[None]
         pick = [0, *range(max(1, len(blocks) - 2), len(blocks))]  # the first and the last two
         thin = slice(None, None, max(1, blocks.shape[1] // BINS))
         found[str(k)] = {
             "name": np.array(_short(recording.name)), "frequency": np.array(recording.frequency() or 0.0), "drive": drive[pick][:, thin],
-            "reading": blocks[pick][:, thin], "number": np.array(pick) + 1,
+            "reading": blocks[pick][:, thin], "number": np.array(pick) + 1, "output": np.array(output),
         }  # fmt: skip
     return found

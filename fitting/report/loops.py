@@ -222,9 +222,8 @@ def _inside_row(axes, row, signals, drive, first):
     axes.locator_params(axis="y", nbins=4)
 
 
-def periods(entries, output: str, stem: str = "periods"):
+def periods(entries, stem: str = "periods"):
     """The readings as recorded: the first and the last periods over each other."""
-    factor, label = scale_of(output)[:2]
     columns = max(2, min(COLUMNS, len(entries)))
     rows = int(np.ceil(len(entries) / columns))
     colours = [VERMILION, BLUE, INK]
@@ -232,6 +231,7 @@ def periods(entries, output: str, stem: str = "periods"):
         figure = canvas(WIDTH * columns / COLUMNS, 2.6 * rows)
         for k, entry in enumerate(entries.values()):
             row, column = divmod(k, columns)
+            factor, label = scale_of(str(entry["output"]))[:2]
             axes = figure.add_axes([(column + 0.19) / columns, 1 - (row + 0.80) / rows, 0.76 / columns, 0.62 / rows])
             for i, (number, reading) in enumerate(zip(entry["number"], entry["reading"], strict=True)):
                 phase = np.arange(len(reading)) / len(reading)

@@ -42,7 +42,8 @@ def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduc
         found["drive"] = best.bench.drive
     _say(progress, "report: signals")
     if diagnosis.verdict == "data_problem" or (base is not None and not math.isfinite(base.chi2_per_sample)):
-        found["recordings"] = evidence.of_recordings(recordings, best.bench) if best is not None else {}
+        named_first = sorted(recordings, key=lambda r: r.name not in diagnosis.message)
+        found["recordings"] = evidence.of_recordings(named_first)
     elif base is not None:
         found["base"] = evidence.of_fit(base, inside=repaired is None)
         found["catalogue"] = json.dumps(catalogue())

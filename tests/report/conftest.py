@@ -100,6 +100,7 @@ def diagnoses(runs, bench, fitted, poor):
         "data_problem": Diagnosis(
             "data_problem", "rec_010Hz.csv: an unsettled transient.", data_problem="an unsettled transient", base=fitted
         ),
+        "unsettled": Diagnosis("data_problem", "rec_010Hz.csv: an unsettled transient.", data_problem="an unsettled transient"),
         "unreadable": Diagnosis("data_problem", "rec.csv: displacement is clipped.", data_problem="clipped"),
     }
 
@@ -123,7 +124,7 @@ def folders(tmp_path_factory, runs, fitted, poor, diagnoses):
     return made
 
 
-KINDS = ("fit", "poor", "attributed", "group", "unknown_at", "nothing_missing", "data_problem", "unreadable")
+KINDS = ("fit", "poor", "attributed", "group", "unknown_at", "nothing_missing", "data_problem", "unsettled", "unreadable")
 
 
 @pytest.fixture(params=KINDS)

@@ -102,6 +102,7 @@ def test_every_figure_and_table_has_words(html, kind):
         "unknown_at": 10,
         "nothing_missing": 10,
         "data_problem": 1,
+        "unsettled": 1,
         "unreadable": 0,
     }
     assert len(outline.all("svg")) >= expected[kind]
