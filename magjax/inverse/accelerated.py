@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..errors import ConfigurationError
+from .operator import ROUNDING
 
 _COMPILED = {}
 
@@ -10,7 +11,7 @@ _COMPILED = {}
 def _arrays(operator):
     stack = np.zeros((2 * operator.cells + len(operator.extrema) + 4096, 2))
     stack[: len(operator.extrema)] = operator.extrema
-    numbers = np.array([operator.low, operator.high, operator.step, operator.offset - operator.total])
+    numbers = np.array([operator.low, operator.high, operator.step, operator.offset - operator.total, ROUNDING * operator.total])
     return np.array(operator.levels), np.array(operator._table), np.array(operator._diagonal), numbers, stack
 
 
@@ -88,6 +89,7 @@ def _kernel():
         if target == value:
             return n, stack[n - 1, 0], False, 0
         rising = target > value
+        near = numbers[4] if slope == 0 else 0.0
         sign = 1.0 if rising else -1.0
         while True:
             start = stack[n - 1, 0]
@@ -107,7 +109,7 @@ def _kernel():
             else:
                 m = m_base - 2 * everett(levels, t, d, L, step, base, v)
             reached = slope * v + m
-            done = reached >= target if rising else reached <= target
+            done = reached >= target - near if rising else reached <= target + near
             if done:
                 j, q = local(levels, L, step, base)
                 bend = q * (1 - q) * d[j]
@@ -125,6 +127,8 @@ def _kernel():
                 root = bb + np.sqrt(max(bb * bb + 8 * c2 * rho, 0.0))
                 found = start + sign * (2 * rho / root if root > 0 else 0.0) * step
                 v = min(found, v) if rising else max(found, v)
+                if v == start:
+                    return n, v, False, iterations
                 if rising:
                     m = m_base + 2 * everett(levels, t, d, L, step, v, base)
                 else:

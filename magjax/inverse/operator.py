@@ -13,12 +13,15 @@ import numpy as np
 from ..errors import ConfigurationError
 
 
+ROUNDING = 2e-15  # of the summed masses: what the sums of the Everett table leave
+
+
 class PlainPreisach:
     """A Preisach operator with memory. `masses` (L, L), A/m, [alpha row, beta column]; `low`, `high`: plane, A/m.
 
     `history`: fields that lead to the start state from negative saturation. Attributes after each call: `field`,
     `magnetization` (A/m), `saturated` (the target was out of range), `unique` (False on a plateau of zero density),
-    `iterations` of the last inversion.
+    `iterations` of the last inversion; after `invert` also `saturated_at` and `ambiguous_at`, (time,) (the latter None if compiled).
     """
 
     def __init__(self, masses, low: float, high: float, offset: float = 0.0, history=()):
@@ -48,6 +51,7 @@ class PlainPreisach:
         self._table, self._diagonal = table.tolist(), masses[k, k].tolist()
         self.extrema = [(self.low, self.offset - self.total)]  # (field, M), alternating; the tip is the last
         self.saturated, self.unique, self.iterations = False, True, 0
+        self.saturated_at = self.ambiguous_at = None
         for value in history:
             self.apply(float(value))
 
@@ -140,10 +144,12 @@ class PlainPreisach:
         self.saturated, self.unique, self.iterations = False, True, 0
         value = slope * self.field + self.magnetization
         if target == value:
+            self.unique = slope > 0 or not (self._flat(True) or self._flat(False))
             return self.field
         if target != target or not slope >= 0:
             raise ConfigurationError(f"target {target} with slope {slope}; give a number, and a slope of zero or more")
         rising = target > value
+        near = ROUNDING * self.total if slope == 0 else 0.0  # else rounding would carry the field across a plateau
         while True:
             start = self.field
             if (start >= self.high) if rising else (start <= self.low):
@@ -159,11 +165,22 @@ class PlainPreisach:
             self.iterations += 1
             m_stop = self._corner_value(stop, rising, base, m_base)
             reached = slope * stop + m_stop
-            if (reached >= target) if rising else (reached <= target):
+            if (reached >= target - near) if rising else (reached <= target + near):
                 v = self._within(start, stop, cell, base, m_base, rising, target, slope)
-                self._advance(v, rising, base, m_base)
+                if v != start:  # a corner without a move would make two of one
+                    self._advance(v, rising, base, m_base)
+                if v == stop and slope == 0:  # inside a cell M rises with the field; a plateau can only begin at its end
+                    self.unique = not self._flat(rising)
                 return v
             self._advance(stop, rising, base, m_base, m_stop)
+
+    def _flat(self, rising) -> bool:
+        """Does M stay as it is when the field goes on this way? (Nothing switches in the cell ahead.)"""
+        if (self.field >= self.high) if rising else (self.field <= self.low):
+            return False  # the end of the plane
+        base, _ = self._branch_base(rising)
+        _, c1, c2 = self._quadratic(self._cell(self.field, rising), base, rising)
+        return abs(c1) + abs(c2) <= ROUNDING * self.total
 
     def _branch_base(self, rising):
         tip = self.extrema[-1]
@@ -185,7 +202,6 @@ class PlainPreisach:
     def _within(self, start, stop, cell, base, m_base, rising, target, slope):
         """Solve the quadratic of one cell from `start` towards `stop`."""
         c0, c1, c2 = self._quadratic(cell, base, rising)
-        self.unique = c1 != 0.0 or c2 != 0.0  # else a plateau: every field of the cell gives this M
         sign = 1.0 if rising else -1.0
         z = (start - self.levels[cell]) / self.step
         here = slope * start + m_base + sign * 2 * (c0 + c1 * z + c2 * z * z)
@@ -218,5 +234,10 @@ class PlainPreisach:
 
             fields, _, saturated, _ = invert_many(self, targets)
             self.saturated = bool(saturated[-1]) if len(saturated) else False
+            self.saturated_at, self.ambiguous_at = saturated, None
             return fields
-        return np.array([self.solve(float(m)) for m in targets])
+        fields, self.saturated_at, self.ambiguous_at = np.empty(len(targets)), *np.zeros((2, len(targets)), bool)
+        for k, target in enumerate(targets.tolist()):
+            fields[k] = self.solve(target)
+            self.saturated_at[k], self.ambiguous_at[k] = self.saturated, not self.unique
+        return fields

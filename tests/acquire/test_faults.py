@@ -91,6 +91,8 @@ def test_damage_on_the_line_is_counted_exactly(emulate, order, faults):
         assert end["lost"] == 0
     else:
         assert 0 < end["lost"] < 30_000 and end["damaged_frames"] > 0
+    gaps = sum(e["samples"] for e in events(made.path, "gap"))
+    assert 0 <= end["lost"] - gaps <= 3 * 64  # what no gap shows is the tail
     if "duplicate=0.05" in faults:
         assert end["repeats"] > 10
 

@@ -8,6 +8,7 @@ import pytest
 from magjax.effects import AmplifierLag
 from magjax.errors import ConfigurationError
 from magjax.inverse import PlainActuator, PlainPreisach, current_for_displacement, implicit_euler
+from magjax.inverse.dynamic import feasible_magnetization
 from magjax.inverse.events import HeldCurrent
 from magjax.preisach import Preisach
 from magjax.simulate import simulate
@@ -91,10 +92,18 @@ def test_saturation_and_plateaus_are_told():
     assert plain.saturated and plain.magnetization == pytest.approx(1.0)
     plain.solve(-3.0)
     assert plain.saturated and plain.corners == 0
-    gap = PlainPreisach(np.diag([0.5, 0.0, 0.5]), 0.0, 3.0, history=(1.0,))  # nothing switches between 1 and 2
-    assert gap.solve(0.25) > 2 and gap.unique
-    gap.solve(0.0)
-    assert not gap.unique or gap.field == pytest.approx(2.0)
+    gap = lambda *history: PlainPreisach(np.diag([0.5, 0.0, 0.5]), 0.0, 3.0, history=history)  # nothing switches between 1 and 2
+    up, down, stays, inside = gap(), gap(3.0), gap(1.5), gap()
+    assert (up.solve(0.0), up.unique) == (1.0, False)  # from below the nearest of all the fields that give M = 0
+    assert (down.solve(0.0), down.unique) == (2.0, False)
+    assert (stays.solve(0.0), stays.unique) == (1.5, False)
+    assert inside.solve(0.25) > 2 and inside.unique and inside.solve(-0.25) < 1 and inside.unique
+    inside.invert([0.3, 0.0, -0.3, 0.0, 2.0])
+    assert inside.ambiguous_at.tolist() == [False, True, False, True, False] and inside.saturated_at.tolist() == 4 * [False] + [
+        True
+    ]
+    smooth = PlainPreisach(np.tril(np.ones((4, 4))), 0.0, 4.0)
+    assert all(smooth.solve(m) is not None and smooth.unique for m in (smooth.copy().apply(1.0), 3.0, smooth.copy().apply(2.0)))
     with pytest.raises(ConfigurationError, match="monotone"):
         PlainPreisach(-np.eye(3), 0, 1)
 
@@ -144,6 +153,18 @@ def test_open_loop_tracking():
         assert np.array_equal(current_for_displacement(plant, wanted, h, accelerate=True)[0], current)
     far, infeasible, _ = current_for_displacement(plant, 3 * wanted, h)
     assert infeasible.any() and np.all(np.isfinite(far))
+
+
+def test_free_displacement_of_a_sine_is_that_of_the_rod():
+    """u = y''/w0^2 + 2 xi y'/w0 + y of (5), for a sine in closed form."""
+    plant = PlainActuator.from_actuator(actuator(12))
+    stroke, w, h = plant.l_rod * plant.lambda_s, 2 * np.pi * 60.0, 1e-5
+    t = h * np.arange(4000)
+    wanted = stroke * (0.5 + 0.2 * np.sin(w * t))
+    M, wrong = feasible_magnetization(plant, wanted, h)
+    r = w / (2 * np.pi * plant.f0)
+    u = 0.5 + 0.2 * ((1 - r * r) * np.sin(w * t) + 2 * plant.xi * r * np.cos(w * t))
+    assert not wrong.any() and np.abs((M / plant.M_s) ** 2 - u)[3:-3].max() < 1e-5
 
 
 def test_invert_command_offers_the_nearest_and_refuses_uneven_time(tmp_path, capsys):
