@@ -1,7 +1,6 @@
 """From a result folder to report.html: one file, offline, without script. JSON and report.npz are all that it reads."""
 
 import json
-import time
 from pathlib import Path
 
 from magjax.errors import ConfigurationError
@@ -75,7 +74,7 @@ class Sketch:
     """Draws pictures one by one, tells which, and skips those whose evidence is not there."""
 
     def __init__(self, say):
-        self.say, self.begin = say, time.perf_counter()
+        self.say = say
 
     def __call__(self, present, draw, *arguments, **options) -> dict | None:
         """The part with the drawn picture, or None where `present` is empty."""
