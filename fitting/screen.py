@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.chain import Timeline
-from magjax.chain.coupled import magnetize
+from magjax.chain.coupled import disturbance_of, magnetize
 from magjax.effects import CATALOGUE
 from magjax.simulate import finish_chain
 
@@ -28,7 +28,6 @@ SHAPE_GRIDS = {
     "field_diffusion": {"tau": (5e-5, 2e-4, 8e-4, 3e-3)},
     "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3)},
     "rate_dependent_switching": {"rate0": (0.3, 10.0, 100.0)},
-    "amplifier_clipping": {"tau_L": (0.0, 1e-3)},
     "second_mode": {"f2": (150.0, 250.0, 400.0, 650.0, 900.0, 1300.0, 2000.0, 3000.0), "xi2": (0.02, 0.1)},
     "coulomb_friction": {"v_s": (1e-5, 3e-4, 3e-3)},
     "sensor_lag": {"order2": (0.0, 0.5)},
@@ -132,42 +131,64 @@ def changed_drive(actuator, drive, line):
 
 
 @eqx.filter_jit
-def _march_columns(predictor, actuator, effects, directions):
-    """d lines / d amplitude of in-step effects and of changes of the drive, all in one program.
+def _trajectory(predictor, actuator):
+    """Relay field, magnetization, coil current and step of the whole march of every recording, grid by grid."""
 
-    `effects`: at null; `directions`: (columns, effects) of amplitudes; the last rows belong to drive changes, which
-    enter as (columns, ...) perturbations of the drive per grid in `directions[1]`.
+    def one(drive, dt):
+        line = Timeline(dt, drive.shape[0], True)
+        current = changed_drive(actuator, drive, line)
+        _, M, v, current = _march(predictor, actuator, current, dt)[:4]
+        return v, M, current, dt
+
+    return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
+
+
+def _march(predictor, actuator, current, dt, disturbance=None):
+    """(4) over all periods that the predictor runs: H, M, relay field, current, residual, overflow."""
+    table = actuator.hysteresis.table()
+    memory = actuator.hysteresis.memory(table, predictor.corners)
+    whole = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
+    H, M, v, residual, over = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, disturbance)
+    return H, M, v, whole[1], residual, over
+
+
+@eqx.filter_jit
+def _disturbance(effect, actuator, trajectory):
+    """d disturbance / d amplitude at null, (3 of (recordings, time)) per grid: the trajectory does not change."""
+
+    def one(v, M, current, dt):
+        def of(a):
+            return disturbance_of(effect.with_amplitude(a), actuator, v, M, current, dt)
+
+        return jax.jvp(of, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
+
+    return tuple(jax.vmap(one)(*part) for part in trajectory)
+
+
+@eqx.filter_jit
+def _march_columns(predictor, actuator, directions):
+    """Change of the lines by disturbances of the march and changes of the drive, to first order, all in one program.
+
+    `directions`: per grid (disturbance (3 of (columns, recordings, time)), change of the current (columns, recordings, grid)).
     """
-    amplitudes, drive_changes = directions
-    whole = dataclasses.replace(actuator, effects=(*actuator.effects, *effects))
-    base = len(actuator.effects)
 
-    def lines_of(values, changes):
-        changed = whole
-        for k, e in enumerate(effects):
-            changed = eqx.tree_at(lambda a, k=k, e=e: getattr(a.effects[base + k], e.amplitude), changed, values[k])
-
-        def one(drive, dt, change):
+    def lines_of(disturbances, changes):
+        def one(drive, dt, given, change):
             count = drive.shape[0]
             line = Timeline(dt, count, True)
             current = changed_drive(actuator, drive, line) + change
-            applied = changed.coil.applied_field(current)
-            table = changed.hysteresis.table()
-            memory = changed.hysteresis.memory(table, predictor.corners)
-            whole_drive = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (applied, current)]
-            H, M, v, res, over = magnetize(changed, *whole_drive, dt, memory, changed.coil.scheme)
-            M = M + changed.hysteresis.unreached(jnp.max(v), jnp.min(v))
+            H, M, v, _, res, over = _march(predictor, actuator, current, dt, given)
+            M = M + actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
             H, M, v, res = (x[-count - 1 : -1] for x in (H, M, v, res))
-            s = finish_chain(changed, line, drive, current, H, M, v, res, over)
+            s = finish_chain(actuator, line, drive, current, H, M, v, res, over)
             return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / count
 
-        parts = [jax.vmap(one)(d, t, c) for d, t, c in zip(predictor.drives, predictor.steps, changes, strict=True)]
-        return jnp.concatenate(parts)[np.asarray(predictor.index)]
+        grids = zip(predictor.drives, predictor.steps, disturbances, changes, strict=True)
+        return jnp.concatenate([jax.vmap(one)(*g) for g in grids])[np.asarray(predictor.index)]
 
-    zero_drive = tuple(jnp.zeros_like(d) for d in predictor.drives)
-    origin = (jnp.zeros(len(effects)), zero_drive)
+    origin = jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), directions)
     _, push = jax.linearize(lines_of, *origin)
-    return jax.lax.map(lambda d: push(*d), (amplitudes, drive_changes), batch_size=8)
+    return jax.lax.map(lambda d: push(*d), directions, batch_size=8)
 
 
 def columns(problem, z):
@@ -181,32 +202,35 @@ def columns(problem, z):
     if late:
         lines = _late_columns(predictor, actuator, states, tuple(c(**shapes) for c, shapes in late))
         found += [(c, shapes, line) for (c, shapes), line in zip(late, lines, strict=True)]
-    marching = [c for c in classes if c.in_step]
-    sources = [(c, shapes) for c in classes if c.block == "source" for shapes in shape_grid(c)]
-    rounds = max([len(shape_grid(c)) for c in marching], default=1)
-    for r in range(rounds):
-        chosen = [shape_grid(c)[min(r, len(shape_grid(c)) - 1)] for c in marching]
-        fresh = [k for k, c in enumerate(marching) if r < len(shape_grid(c))]
-        extra = sources if r == 0 else []
-        width = len(marching) + len(sources)
-        amplitudes = np.zeros((width, len(marching)))
-        amplitudes[np.arange(len(marching)), np.arange(len(marching))] = 1.0
-        changes = tuple(np.zeros((width, *d.shape)) for d in predictor.drives)
-        for k, (c, shapes) in enumerate(extra):
-            for g, (drive, dt) in enumerate(zip(predictor.drives, predictor.steps, strict=True)):
-                changes[g][len(marching) + k] = _drive_change(c(**shapes), drive, dt, actuator)
-        effects = tuple(c(**s) for c, s in zip(marching, chosen, strict=True))
-        lines = _march_columns(predictor, actuator, effects, (jnp.asarray(amplitudes), tuple(jnp.asarray(c) for c in changes)))
-        found += [(marching[k], chosen[k], lines[k]) for k in fresh]
-        found += [(c, s, lines[len(marching) + k]) for k, (c, s) in enumerate(extra)]
+    marching = [(c, shapes) for c in classes if c.in_step for shapes in shape_grid(c)]
+    drives = [np.asarray(d) for d in predictor.drives]
+    sources = [
+        (c, shapes) for c in classes if c.block == "source" for shapes in (c.finite_trials(drives, predictor.steps) or shape_grid(c))
+    ]  # fmt: skip
+    if marching or sources:
+        trajectory = _trajectory(predictor, actuator)
+        rows = []
+        for c, shapes in marching:
+            rows.append((_disturbance(c(**shapes), actuator, trajectory), tuple(jnp.zeros_like(d) for d in predictor.drives)))
+        still = tuple(tuple(jnp.zeros_like(part[0]) for _ in range(3)) for part in trajectory)
+        for c, shapes in sources:
+            finite = c.amplitude in shapes
+            grids = zip(predictor.drives, predictor.steps, strict=True)
+            rows.append((still, tuple(_drive_change(c(**shapes), d, t, actuator, finite) for d, t in grids)))
+        lines = _march_columns(predictor, actuator, jax.tree.map(lambda *x: jnp.stack(x), *rows))
+        found += [(c, s, line) for (c, s), line in zip(marching + sources, lines, strict=True)]
     zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
     return [(c, s, np.asarray(whitened(line, zero))) for c, s, line in found]
 
 
 @eqx.filter_jit
-def _drive_change(effect, drive, dt, actuator):
+def _drive_change(effect, drive, dt, actuator, finite):
+    """What a source effect does to the drive: its derivative at null, or, `finite`, all of it."""
+
     def one(d, h):
         line = Timeline(h, d.shape[0], True)
+        if finite:
+            return effect.drive(d, line, actuator) - d
         return jax.jvp(lambda a: effect.with_amplitude(a).drive(d, line, actuator), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
     return jax.vmap(one)(drive, dt)
@@ -264,9 +288,12 @@ def screen(problem, solution) -> list[Candidate]:
         z = max(score, 0.0) if one_sided else score
         if length / size < 1e-4:
             z = 0.0
+        amplitude, visible = score / max(length, 1e-300), float(5 / max(length, 1e-300))
+        if effect.amplitude in shapes:  # scored at a finite amplitude: start the fit there
+            amplitude, visible = shapes[effect.amplitude], shapes[effect.amplitude]
+            shapes = {k: v for k, v in shapes.items() if k != effect.amplitude}
         candidate = Candidate(
-            effect.name, effect.block, z, float(length / size), score / max(length, 1e-300), shapes, float(z * z),
-            float(5 / max(length, 1e-300)), one_sided, part / max(length, 1e-300),
+            effect.name, effect.block, z, float(length / size), amplitude, shapes, float(z * z), visible, one_sided, part / max(length, 1e-300),
         )  # fmt: skip
         if effect.name not in best or abs(candidate.z) > abs(best[effect.name].z):
             best[effect.name] = candidate

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import magjax.effects as effects
-from magjax.chain import BLOCKS
+from magjax.chain import BLOCKS, Timeline
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.simulate import run_chain
 from tests.test_simulate import actuator, sine
@@ -49,6 +49,10 @@ def test_null_gradient_and_batch(kind):
         return reading(extended.replace({name: value}))
 
     value = 0.3 * scale
+    finite = kind.finite_trials([CURRENT[None]], [np.asarray([DT])])
+    if finite:  # no derivative at null: where it acts
+        extended = act.with_effect(kind(**finite[-1]))
+        value = finite[-1][kind.amplitude]
     exact = np.asarray(eqx.filter_jit(lambda v: jax.jvp(at, (v,), (jnp.ones_like(v),))[1])(jnp.asarray(value)))
     step = 1e-4 * scale
     number = (np.asarray(at(value + step)) - np.asarray(at(value - step))) / (2 * step)
@@ -56,6 +60,16 @@ def test_null_gradient_and_batch(kind):
     assert np.abs(exact - number).max() < 2e-4 * np.abs(number).max()
     both = jax.vmap(lambda c: reading(extended.replace({name: value}), c))(jnp.stack([CURRENT, 0.5 * CURRENT]))
     assert np.asarray(both[1]) == pytest.approx(np.asarray(reading(extended.replace({name: value}), 0.5 * CURRENT)), abs=1e-16, rel=1e-9)
+
+
+def test_a_limited_voltage_bounds_the_current():
+    command = np.asarray(CURRENT)
+    effect = effects.AmplifierClipping(inverse_limit=1 / 0.6, tau_L=2e-3)
+    current = np.asarray(effect.drive(CURRENT, Timeline(jnp.asarray(DT), N, True), None))
+    voltage = current + 2e-3 * (current - np.roll(current, 1)) / DT
+    assert np.abs(voltage).max() == pytest.approx(0.6, rel=1e-9) and np.abs(command).max() > 0.65
+    free = np.abs(voltage) < 0.6 * (1 - 1e-9)
+    assert 0.1 < free.mean() < 0.9 and np.array_equal(current[free], command[free])
 
 
 def test_smooth_friction_approaches_coulomb():

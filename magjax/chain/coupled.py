@@ -135,11 +135,12 @@ def _extra_terms(effects, states, actuator, trial, p, q):
     return p * shift + q * added + loss, shift, added
 
 
-def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid"):
+def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid", disturbance=None):
     """March (4) from equilibrium: (field H, magnetization M, relay field, residual, overflow) over time.
 
     `applied`: c0 I + H_bias, A/m, (time,); `current` the drive, for effects; `h`: step, s; `memory`: the start state.
     The field H is that of (4); the relays see H less the shifts of hysteresis effects. `residual`: A/m, (time,).
+    `disturbance`: what is added at every step as an effect would, (field shift, magnetization, loss), A/m, (time,) each.
     """
     if scheme not in SCHEMES:
         raise ConfigurationError(f'scheme = "{scheme}" is unknown; write one of {", ".join(SCHEMES)}')
@@ -159,9 +160,11 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
     carry = _Carry(memory, X, X, first, applied[0], states, zero)
 
     def advance(c: _Carry, drive):
-        applied1, current1 = drive
+        applied1, current1, *given = drive
         old = a * (2 * c.X0 - 0.5 * c.X_before) if bdf else a * c.X0 - 0.5 * c.H0 + 0.5 * c.applied0
         rhs = old + (applied1 if bdf else 0.5 * applied1)
+        if given:
+            rhs = rhs - (p * given[0] + q * given[1] + given[2])
 
         def trial_at(v, m):
             X1 = v + m
@@ -177,13 +180,15 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
         trial = trial_at(v, m)
         states = tuple(e.advance(trial, s, actuator) for e, s in zip(effects, c.states, strict=True))
         H, M = v + extra[1], m + extra[2]
+        if given:
+            H, M = H + given[0], M + given[1]
         residual = p * v + q * m + extra[0] - rhs
         if effects:  # the relays' own M at that field, so that a step that did not settle shows
             own, _, threshold, m_there = c.memory.branch(table, v)
             residual = residual + (branch_magnetization(table, own, threshold, m_there, v) - m)
         return _Carry(memory, H + M, c.X0, H, applied1, states, residual), (H, M, v, residual)
 
-    carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:]))
+    carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:], *(d[1:] for d in disturbance or ())))
 
     def with_first(value, rest):
         return jnp.concatenate([jnp.reshape(value, (1,)), rest])
@@ -191,6 +196,31 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
     H = with_first(first, H)
     M = with_first(rest.magnetization + added, M)
     return H, M, with_first(rest.field, v), with_first(zero, residual), carry.memory.overflow
+
+
+def disturbance_of(effect, actuator, field, magnetization, current, h):
+    """What an effect would add at every step of a trajectory that it does not change: see `magnetize`.
+
+    `field`, `magnetization`: A/m, `current`: A, all (time,), of a march with the actuator's own coil.
+    """
+    scale = MU0 / h
+    bdf = actuator.coil.scheme == "bdf2"
+    X = field + magnetization
+    zero = jnp.zeros_like(X[0])
+    state = effect.start(Trial(field[0], magnetization[0], zero, zero, current[0], h), actuator)
+
+    def advance(carry, now):
+        state, X0, X_before, before = carry
+        v, m, drive, X1 = now
+        change = (1.5 * X1 - 2 * X0 + 0.5 * X_before) if bdf else X1 - X0
+        trial = Trial(v, m, scale * change, (v - before) / h, drive, h)
+        shift, added = effect.field_shift(trial, state, actuator), effect.magnetization(trial, state, actuator)
+        loss = effect.block == "coil"
+        row = (zero if loss else shift, added, shift if loss else zero)
+        return (effect.advance(trial, state, actuator), X1, X0, v), row
+
+    rows = jax.lax.scan(advance, (state, X[0], X[0], field[0]), (field[1:], magnetization[1:], current[1:], X[1:]))[1]
+    return tuple(jnp.concatenate([zero[None], r]) for r in rows)
 
 
 def _solve_with_effects(table, c, effects, actuator, trial_at, p, q, rhs):

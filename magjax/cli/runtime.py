@@ -19,7 +19,7 @@ def prepare_jax() -> None:
     try:
         cache.mkdir(parents=True, exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
     except OSError:
         pass  # without a cache every run compiles anew; nothing else is lost
 

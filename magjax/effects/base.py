@@ -61,6 +61,14 @@ class AbstractEffect(eqx.Module):
         """Declared parameters: name -> ParameterInfo."""
         return parameters_of(cls)
 
+    @classmethod
+    def finite_trials(cls, drives, steps):
+        """For a source effect without a derivative at null: parameters at which the screening tries it, else None.
+
+        `drives`: per grid, (recordings, samples), `steps`: (recordings,), s.
+        """
+        return None
+
     def drive(self, current, line, actuator):
         """Current after this effect, A, (time,)."""
         return current
