@@ -1,4 +1,4 @@
-"""Recordings out: CSV, NetCDF, MATLAB, each whole or not at all."""
+"""Recordings out: CSV, NetCDF, MATLAB, Parquet, each whole or not at all."""
 
 from pathlib import Path
 
@@ -16,12 +16,12 @@ UNITS = {
 
 
 def write_recording(path, recording) -> None:
-    """Write a recording; the ending says how: .csv, .nc or .mat."""
+    """Write a recording; the ending says how: .csv, .nc, .mat or .parquet (needs pyarrow)."""
     path = Path(path)
     partial = path.with_name(path.name + ".part")
-    writer = {".csv": _csv, ".nc": _netcdf, ".mat": _mat}.get(path.suffix.lower())
+    writer = {".csv": _csv, ".nc": _netcdf, ".mat": _mat, ".parquet": _parquet}.get(path.suffix.lower())
     if writer is None:
-        raise ConfigurationError(f"{path}: ending {path.suffix or '(none)'} is unknown; write .csv, .nc or .mat")
+        raise ConfigurationError(f"{path}: ending {path.suffix or '(none)'} is unknown; write .csv, .nc, .mat or .parquet")
     try:
         writer(partial, recording)
         partial.replace(path)
@@ -55,3 +55,9 @@ def _mat(path, recording):
     from scipy.io import savemat
 
     savemat(path, _columns(recording), appendmat=False)
+
+
+def _parquet(path, recording):
+    from .acquire.export import write_parquet
+
+    write_parquet(path, _columns(recording), recording.origin.get("metadata", {}))

@@ -46,13 +46,13 @@ class Live:
             self.live.update(Spinner("dots", text=text))
 
     def _row(self, state):
-        rate = 0.0
+        rate = ""
         if self.before and state["host_time"] > self.before["host_time"]:
-            rate = (state["received"] - self.before["received"]) / (state["host_time"] - self.before["host_time"])
+            rate = f" {(state['received'] - self.before['received']) / (state['host_time'] - self.before['host_time']):.4g}/s,"
         self.before = state
         free = state["disk_free"] / 1e9
         return (
-            f"{self.title}{state['acknowledged']} samples safe, {rate:.4g}/s, {state['lost']} lost, {state['damaged_frames']} damaged frames, "
+            f"{self.title}{state['acknowledged']} samples safe,{rate} {state['lost']} lost, {state['damaged_frames']} damaged frames, "
             f"{state['bytes'] / 1e6:.2f} MB written, {free:.0f} GB free"
         )
 

@@ -48,7 +48,7 @@ class Line:
 
 
 class PtyLine(Line):
-    """A pseudo-terminal; `link`: a name that points to it, with a number at its end that grows at every replug."""
+    """A pseudo-terminal; `link`: a name that points to it; after it was unplugged it comes back with a number behind."""
 
     def __init__(self, link=None, baud=None):
         super().__init__(baud)
@@ -66,7 +66,7 @@ class PtyLine(Line):
         os.close(slave)
         self.place = None
         if self.link:
-            self.place = Path(f"{self.link}{self.number}")
+            self.place = Path(f"{self.link}{self.number or ''}")
             if self.place.exists() and not self.place.is_symlink():
                 raise DeviceError(f"--link {self.link}: {self.place} is there and no link; choose another name")
             try:

@@ -20,6 +20,8 @@ def export_log(path, target) -> list[Path]:
     """
     path, target = Path(path), Path(target)
     writer = known_ending(target)
+    if target.is_dir():
+        raise ConfigurationError(f"{target}: is a folder; give the name of a file in it")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     segments, written = read_log(path), []
     for k, (table, metadata) in enumerate(segments):
@@ -55,7 +57,8 @@ def _mat(path, table, metadata):
     savemat(path, {**table, "provenance": "\n".join(f"{k}: {v}" for k, v in metadata.items())}, appendmat=False)
 
 
-def _parquet(path, table, metadata):
+def write_parquet(path, table, metadata):
+    """Columns (SI, names with units) as Parquet, `metadata` in its schema; raises `ConfigurationError` without pyarrow."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -66,7 +69,7 @@ def _parquet(path, table, metadata):
     pyarrow.parquet.write_table(made, path)
 
 
-WRITERS = {".nc": _netcdf, ".csv": _csv, ".mat": _mat, ".parquet": _parquet}
+WRITERS = {".nc": _netcdf, ".csv": _csv, ".mat": _mat, ".parquet": write_parquet}
 
 
 def known_ending(target: Path):

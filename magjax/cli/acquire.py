@@ -70,7 +70,7 @@ def run_emulate(arguments) -> int:
     p.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE",
                    help="drop, flip, merge, duplicate (probabilities), zeros, reset, stall, unplug, wrap, drift, shift, at")  # fmt: skip
     p.add_argument("--tcp", type=int, metavar="PORT", help="listen on this TCP port (0: a free one) instead of a pseudo-terminal")
-    p.add_argument("--link", help="name that points to the pseudo-terminal; a number is added")
+    p.add_argument("--link", help="name that points to the pseudo-terminal (NAME1 after it was unplugged)")
     p.add_argument("--fast", action="store_true", help="as fast as it goes instead of real time")
     p.add_argument("--baud", type=float, help="pace the line: bits a second (ten a byte)")
     p.add_argument("--rate-max", type=float, default=2e5, help="fastest sampling, Hz (default 200000)")

@@ -32,10 +32,10 @@ def run_check(arguments, _command) -> int:
 
 def run_convert(arguments, command) -> int:
     """magjax import and export: recordings from one format into another."""
-    p = parser(command, "Convert recordings: the ending of --out says into what (.nc, .csv, .mat).", f"magjax {command} rec.mat --out rec.nc")
+    p = parser(command, "Convert recordings: the ending of --out says into what (.nc, .csv, .mat, .parquet).", f"magjax {command} rec.mat --out rec.nc")
     p.add_argument("recording", help="a recording")
     p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name")
-    p.add_argument("--out", required=True, help="file to write: .nc, .csv or .mat")
+    p.add_argument("--out", required=True, help="file to write: .nc, .csv, .mat or .parquet")
     options = p.parse_args(arguments)
     from magjax.bench import load_bench
     from magjax.recording import load_recordings
@@ -44,6 +44,12 @@ def run_convert(arguments, command) -> int:
     target = Path(options.out)
     output_folder(target.parent)
     written = []
+    if Path(options.recording).suffix.lower() == ".mjlog" and Path(options.recording).is_file():  # with command and provenance
+        from magjax.acquire.export import export_log
+
+        written = [str(path) for path in export_log(options.recording, target)]
+        print(json.dumps({"files": written}) if options.json else "wrote " + ", ".join(written))
+        return 0
     recordings = load_recordings([options.recording], load_bench(options.bench))
     for k, recording in enumerate(recordings):
         path = target if len(recordings) == 1 else target.with_name(f"{target.stem}_{k:03d}{target.suffix}")

@@ -181,3 +181,41 @@ def test_a_damaged_start_is_told_by_the_counts_at_the_end(tmp_path):
     content[starts[1] + 40] ^= 1
     path.write_bytes(content)
     assert "transient is not cut off" in mjlog.read_log(path)[0][1]["start"]
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".csv", ".mat", ".parquet"])
+def test_the_command_exports_a_log_with_its_provenance(tmp_path, suffix, capsys):
+    from magjax.cli import main
+
+    path, target = tmp_path / "a.mjlog", tmp_path / f"w\u00f6rk{suffix}"
+    write(path)
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    assert main(["export", str(path), "--out", str(target)]) == 0
+    again = tmp_path / f"again{'.csv' if suffix == '.nc' else suffix}"
+    if suffix != ".parquet":
+        assert main(["import", str(target), "--out", str(again)]) == 0
+        assert load_recordings([again], "aa-050h")[0].n_samples == 800
+    else:
+        assert main(["export", str(path), "--out", str(tmp_path / "b.csv")]) == 0
+        assert main(["import", str(tmp_path / "b.csv"), "--out", str(again)]) == 0 and again.exists()
+    content = target.read_bytes()
+    assert suffix == ".nc" or b"bench 1" in content
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_exports_that_cannot_be_are_one_line(tmp_path, capsys):
+    from magjax.cli import main
+
+    path = tmp_path / "a.mjlog"
+    write(path)
+    (tmp_path / "empty.mjlog").write_bytes(b"")
+    (tmp_path / "torn.mjlog").write_bytes(path.read_bytes()[:50])
+    (tmp_path / "folder.nc").mkdir()
+    for source, out, status in (
+        ("a.mjlog", "x.xyz", 2), ("a.mjlog", "folder.nc", 2), ("empty.mjlog", "x.nc", 3), ("torn.mjlog", "x.nc", 3), ("no.mjlog", "x.nc", 3),
+    ):  # fmt: skip
+        assert main(["export", str(tmp_path / source), "--out", str(tmp_path / out)]) == status, (source, out)
+        text = capsys.readouterr().err
+        assert text.count("\n") == 1 and source.split(".")[0] in text or out in text
+    assert not (tmp_path / "x.nc").exists()

@@ -332,7 +332,7 @@ def test_bad_input_is_one_line(emulate, tmp_path, capsys):
     with open(port):
         done = magjax("record", port, "--out", str(tmp_path / "b.mjlog"))
         assert done.returncode == 5 and "in use by process" in done.stderr
-    (tmp_path / "tty0").write_text("a file of the user's")
+    (tmp_path / "tty").write_text("a file of the user's")
     for arguments in (
         ["--fault", "drop=2"],
         ["--frame", "0"],
@@ -351,6 +351,6 @@ def test_bad_input_is_one_line(emulate, tmp_path, capsys):
     for arguments in (["--tcp", "99999"], ["--link", str(tmp_path / "tty")], ["--link", str(tmp_path / "absent" / "tty")]):
         assert main(["emulate", "--bench", "plain", *arguments]) == 5, arguments
         assert capsys.readouterr().err.count("\n") == 1
-    assert (tmp_path / "tty0").read_text() == "a file of the user's"
+    assert (tmp_path / "tty").read_text() == "a file of the user's"
     assert main(["ports", "--json"]) == 0
     json.loads(capsys.readouterr().out)
