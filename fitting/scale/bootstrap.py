@@ -66,7 +66,8 @@ class Bootstrap:
                 "estimate": float(self.estimate[k]), "stderr": float(self.stderr[k]), "unit": self.units[k],
             }  # fmt: skip
         return {
-            "kind": self.kind, "draws": len(self.draws), "settled": int(self.converged.sum()), "level": self.level, "seed": self.seed,
+            "kind": self.kind, "draws": len(self.draws), "settled": int(self.converged.sum()), "level": self.level,
+            "seed": self.seed,
             "parameters": rows,
         }  # fmt: skip
 
@@ -79,7 +80,10 @@ class Bootstrap:
         return xr.Dataset(data, attrs={"kind": self.kind, "level": self.level, "seed": self.seed})
 
     def __str__(self):
-        lines = [f"  bootstrap ({self.kind}), {len(self.draws)} draws, {int(self.converged.sum())} settled, {100 * self.level:g} % intervals"]
+        lines = [
+            f"  bootstrap ({self.kind}), {len(self.draws)} draws, {int(self.converged.sum())} settled, "
+            f"{100 * self.level:g} % intervals"
+        ]
         for k, name in enumerate(self.names):
             low, high = self.interval(name)
             scatter = f"deviation {self.deviation(name):.2g} (stated {self.stderr[k]:.2g})"
@@ -88,7 +92,15 @@ class Bootstrap:
 
 
 def bootstrap_intervals(
-    result, count: int = 200, *, kind: str = "parametric", level: float = 0.95, seed: int = 0, executor=None, checkpoint=None, progress=None
+    result,
+    count: int = 200,
+    *,
+    kind: str = "parametric",
+    level: float = 0.95,
+    seed: int = 0,
+    executor=None,
+    checkpoint=None,
+    progress=None,
 ) -> Bootstrap:
     """Bootstrap of a `FitResult`.
 
@@ -102,7 +114,8 @@ def bootstrap_intervals(
         raise ConfigurationError("the fit frees no scalar parameter; name some in [fit] free of the bench file")
     if count < 2 or not 0.5 <= level < 1 or kind not in KINDS:
         raise ConfigurationError(
-            f'bootstrap of {count} draws, level {level}, "{kind}": give 2 draws or more, a level of 0.5 to 1 and one of {", ".join(KINDS)}'
+            f'bootstrap of {count} draws, level {level}, "{kind}": '
+            f"give 2 draws or more, a level of 0.5 to 1 and one of {', '.join(KINDS)}"
         )
     blocks = [period_lines(s, problem.target.lines.shape[1]) for s in problem.spectra] if kind == "blocks" else None
     weights = result.refined.weights
@@ -112,10 +125,14 @@ def bootstrap_intervals(
         "lines": model_lines(problem, centre.z), "blocks": blocks,
     }  # fmt: skip
     chunks = [Chunk(f"draws {k}-{min(k + CHUNK, count) - 1}", min(CHUNK, count - k)) for k in range(0, count, CHUNK)]
-    outcome = run_job(Job(f"{kind} bootstrap", draw, inputs, tuple(chunks), seed), executor, checkpoint=checkpoint, progress=progress)
+    outcome = run_job(
+        Job(f"{kind} bootstrap", draw, inputs, tuple(chunks), seed), executor, checkpoint=checkpoint, progress=progress
+    )
     values, chi2, converged = (np.concatenate([r[k] for r in outcome.results]) for k in ("values", "chi2", "converged"))
     if converged.sum() < 2:
-        raise ConfigurationError(f"only {int(converged.sum())} of {count} refits settled; the fit itself has not: raise --max-jacobians")
+        raise ConfigurationError(
+            f"only {int(converged.sum())} of {count} refits settled; the fit itself has not: raise --max-jacobians"
+        )
     rows = [result.estimate(n) for n in names]
     return Bootstrap(
         names, tuple(r.unit for r in rows), np.asarray([r.value for r in rows]), np.asarray([r.stderr for r in rows]),
@@ -130,7 +147,9 @@ def draw(inputs, count, rng):
         noise = parametric_noise(problem.target, rng) if inputs["blocks"] is None else block_noise(inputs["blocks"], rng)
         drawn = with_lines(problem, inputs["lines"] + noise)
         found = settle(drawn, inputs["z"], inputs["weights"], jacobian=inputs["jacobian"])
-        rows.append(([float(problem.layout.value(n, jnp.asarray(found.z))) for n in problem.layout.names], found.chi2, found.converged))
+        rows.append(
+            ([float(problem.layout.value(n, jnp.asarray(found.z))) for n in problem.layout.names], found.chi2, found.converged)
+        )
     values, chi2, converged = zip(*rows, strict=True)
     return {"values": np.asarray(values), "chi2": np.asarray(chi2), "converged": np.asarray(converged)}
 
@@ -165,12 +184,14 @@ def parametric_noise(target, rng):
 def period_lines(spectrum, count: int):
     """How each period's lines differ from their mean, (periods, count) complex, widened for what drawing in blocks loses.
 
-    Circular blocks of b out of P periods give a mean whose variance is short by 1 - b/P. Raises `ConfigurationError` below three periods.
+    Circular blocks of b out of P periods give a mean whose variance is short by 1 - b/P. Raises `ConfigurationError`
+    below three periods.
     """
     periods, samples = spectrum.periods, spectrum.samples
     if periods < FEWEST_PERIODS:
         raise ConfigurationError(
-            f"{spectrum.name}: {periods} period{'s' if periods > 1 else ''} cannot be drawn in blocks ({FEWEST_PERIODS} or more); use the parametric bootstrap"
+            f"{spectrum.name}: {periods} period{'s' if periods > 1 else ''} cannot be drawn in blocks ({FEWEST_PERIODS} or more); "
+            "use the parametric bootstrap"
         )
     phases = np.arange(samples) * (periods / samples)
     lines = np.zeros((periods, count), complex)

@@ -30,7 +30,10 @@ STATES = ("fitted", "not converged", "failed")
 
 @dataclasses.dataclass(frozen=True)
 class Fleet:
-    """One row an actuator, in the order of the folders. `rows`: dicts of FIXED, "parameters": {name: {value, stderr, unit, ...}}."""
+    """One row an actuator, in the order of the folders.
+
+    `rows`: dicts of FIXED, and "parameters": {name: {value, stderr, unit, ...}}.
+    """
 
     rows: tuple[dict, ...]
     outcome: object = dataclasses.field(repr=False, default=None)
@@ -82,7 +85,8 @@ class Fleet:
     def __str__(self):
         lines = [", ".join(f"{self.count(s)} {s}" for s in STATES) + f" of {len(self.rows)} actuators"]
         for name in self.parameter_names:
-            values = np.asarray([r["parameters"][name]["value"] for r in self.rows if name in r["parameters"] and r["status"] == "fitted"])
+            fitted = [r["parameters"] for r in self.rows if r["status"] == "fitted"]
+            values = np.asarray([p[name]["value"] for p in fitted if name in p])
             if len(values):
                 low, middle, high = np.percentile(values, (5, 50, 95))
                 lines.append(f"  {name:32s} median {middle:<12.6g} {self.unit(name):10s} (5 to 95 %: {low:.5g} to {high:.5g})")
@@ -109,7 +113,7 @@ def fit_fleet(
     if not found:
         raise ConfigurationError(f"no folder among {len(paths)} paths; give one folder of recordings for each actuator")
     bench = None if bench is None else load_bench(bench)
-    chunks = tuple(Chunk(str(f), {"folder": str(f.resolve()), "files": _files(f)}) for f in found)
+    chunks = tuple(Chunk(str(f.resolve()), {"folder": str(f.resolve()), "files": _files(f)}) for f in found)
     inputs = {"bench": bench, "choices": choices, "models": models}
     outcome = run_job(Job("fleet", fit_folder, inputs, chunks), executor, checkpoint=checkpoint, progress=progress)
     names = [f.name for f in found]
@@ -136,9 +140,9 @@ def fit_folder(inputs, item, rng):
         row |= _fit(inputs, folder, [name for name, *_ in item["files"]])
     except MagjaxError as error:
         row["message"] = str(error)
-    except (ArithmeticError, ValueError, np.linalg.LinAlgError, RuntimeError) as error:
-        # numerics of a strange recording: a row of this fleet, and worth a report
-        row["message"] = f"unexpected {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    except Exception as error:  # a defect that one strange recording brings out must not end a fleet of thousands
+        words = str(error).splitlines()[0] if str(error) else "no words"
+        row["message"] = f"unexpected {type(error).__name__}: {words} (a defect: please report it with these recordings)"
     row["seconds"] = time.perf_counter() - begin
     return row
 

@@ -72,7 +72,9 @@ class Profile:
         for k, name in enumerate(self.names):
             low, high = self.ends[name]
             notes = "; ".join(e.note for e in (low, high) if e.note)
-            lines.append(f"  {name:32s} {low.value:12.6g} .. {high.value:<12.6g} {self.units[k]:10s}" + (f" ({notes})" if notes else ""))
+            lines.append(
+                f"  {name:32s} {low.value:12.6g} .. {high.value:<12.6g} {self.units[k]:10s}" + (f" ({notes})" if notes else "")
+            )
         return "\n".join(lines)
 
 
@@ -96,7 +98,9 @@ def profile_intervals(result, names=None, *, level: float = 0.95, executor=None,
     """
     layout = result.problem.layout
     if not layout.names or not 0.5 <= level < 1:
-        raise ConfigurationError(f"profile at level {level} of {len(layout.names)} free parameters: give a level of 0.5 to 1 and free a parameter")
+        raise ConfigurationError(
+            f"profile at level {level} of {len(layout.names)} free parameters: give a level of 0.5 to 1 and free a parameter"
+        )
     names = layout.names if names is None else full_names(names, layout.names)
     problem, weights = lean(result.problem), result.refined.weights
     centre = settle(problem, result.refined.z, weights)

@@ -4,7 +4,7 @@ import json
 import sys
 from pathlib import Path
 
-from magjax.errors import ConfigurationError
+from magjax.errors import ConfigurationError, MagjaxError
 
 from .runtime import Progress, output_folder, parser, prepare_jax
 from .scale import add_intervals, check_intervals, intervals, run_fleet
@@ -72,7 +72,11 @@ def run_fit(arguments) -> int:
     held = tuple(f"effects.{e.name}.{q}" for e in (actuator.effects if actuator else ()) for q in e.parameters())
     with Progress(options.quiet or options.json) as progress:
         result = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
-        more, text = intervals(result, options, folder, progress)
+        (more, text), stopped = ({}, ""), None
+        try:
+            more, text = intervals(result, options, folder, progress)
+        except (MagjaxError, KeyboardInterrupt) as error:  # the fit itself is done and is kept
+            stopped = error
         content = result.as_dict() | more
         content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
         if folder:
@@ -89,6 +93,8 @@ def run_fit(arguments) -> int:
             print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g})")
         if folder:
             print(f"\nresults in {folder} (report.html, fit.json, model.json)")
+    if stopped is not None:
+        raise stopped
     return 0 if result.converged else 4
 
 

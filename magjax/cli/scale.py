@@ -15,7 +15,12 @@ def add_where(p, what: str) -> None:
 def add_intervals(p) -> None:
     """Options of `fit` that ask for many fits."""
     p.add_argument("--bootstrap", type=int, metavar="N", help="intervals from N refits of recordings drawn again")
-    p.add_argument("--bootstrap-kind", choices=("parametric", "blocks"), default="parametric", help="noise from its model, or from the recorded periods")
+    p.add_argument(
+        "--bootstrap-kind",
+        choices=("parametric", "blocks"),
+        default="parametric",
+        help="noise from its model, or from the recorded periods",
+    )
     p.add_argument("--profile", metavar="NAMES", help="profile-likelihood intervals: R_eddy,xi or all")
     p.add_argument("--fleet", nargs="+", metavar="DIR", help="one fit a folder of recordings; a table of all in --out")
     add_where(p, "what the bootstrap or the fleet has done")
@@ -39,6 +44,10 @@ def check_intervals(options) -> None:
         raise ConfigurationError(f"--bootstrap {options.bootstrap}; give 2 or more, 200 for 95 % intervals")
     if options.fleet and (options.bootstrap or options.profile or options.model):
         raise ConfigurationError("--fleet goes with neither --bootstrap, --profile nor --model; fit one folder by itself for these")
+    if options.fleet and options.check:
+        raise ConfigurationError(
+            "--fleet takes no --check; recordings whose names begin with check_ take no part in their folder's fit"
+        )
     if options.fleet and options.recordings:
         raise ConfigurationError(f"--fleet takes folders after it and no recordings beside it ({options.recordings[0]})")
     if not options.fleet and not options.recordings:
@@ -53,7 +62,13 @@ def intervals(result, options, folder, progress):
         from fitting.scale import bootstrap_intervals
 
         found = bootstrap_intervals(
-            result, options.bootstrap, kind=options.bootstrap_kind, seed=options.seed, executor=executor, checkpoint=options.checkpoint, progress=progress
+            result,
+            options.bootstrap,
+            kind=options.bootstrap_kind,
+            seed=options.seed,
+            executor=executor,
+            checkpoint=options.checkpoint,
+            progress=progress,
         )
         content["bootstrap"] = found.as_dict()
         texts += [str(found), f"  {found.outcome}"]

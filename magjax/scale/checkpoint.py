@@ -33,8 +33,8 @@ def _content(line: bytes):
 class Checkpoint:
     """Finished chunks of a job: `done` maps (chunk id, digest of its item) to the encoded result.
 
-    `header`: what makes the job: its name, digest and versions. Raises `ConfigurationError` where the file belongs to another
-    job, is no checkpoint, is held by a running job or cannot be written.
+    `header`: what makes the job: its name, digest and versions. Raises `ConfigurationError` where the file belongs to
+    another job, is no checkpoint, is held by a running job or cannot be written.
     """
 
     def __init__(self, path, header: dict):
@@ -45,7 +45,8 @@ class Checkpoint:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self.path, "a+b")
         except OSError as error:
-            raise ConfigurationError(f"{path}: the checkpoint cannot be written ({error.strerror}); choose another --checkpoint") from None
+            words = f"the checkpoint cannot be written ({error.strerror}); choose another --checkpoint"
+            raise ConfigurationError(f"{path}: {words}") from None
         try:
             self._lock()
             self._read()
@@ -67,20 +68,23 @@ class Checkpoint:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ConfigurationError(f"{self.path}: another job is writing to this checkpoint; wait for it or choose another file") from None
+            words = "another job is writing to this checkpoint; wait for it or choose another file"
+            raise ConfigurationError(f"{self.path}: {words}") from None
 
     def _read(self):
         self._file.seek(0)
-        lines = self._file.read().splitlines(keepends=True)
-        if not lines or (len(lines) == 1 and not lines[0].endswith(b"\n") and self._begins_as_header(lines[0])):
+        first = self._file.readline()
+        if not first or (not first.endswith(b"\n") and self._begins_as_header(first)):
             self._file.truncate(0)
             self._append(self.header)
             return
-        self._compare(_content(lines[0]))
-        if not lines[-1].endswith(b"\n"):
-            self._file.truncate(sum(map(len, lines[:-1])))
-            lines.pop()
-        for line in lines[1:]:
+        self._compare(_content(first))
+        whole = self._file.tell()
+        for line in self._file:
+            if not line.endswith(b"\n"):
+                self._file.truncate(whole)
+                break
+            whole += len(line)
             row = _content(line)
             if row is None:
                 self.damaged += 1
@@ -94,7 +98,8 @@ class Checkpoint:
 
     def _compare(self, found):
         if not isinstance(found, dict) or found.get("format") != FORMAT:
-            raise ConfigurationError(f"{self.path}: not a checkpoint of magjax (its first line is not one); choose another --checkpoint")
+            words = "not a checkpoint of magjax (its first line is not one); choose another --checkpoint"
+            raise ConfigurationError(f"{self.path}: {words}")
         different = [k for k in self.header if found.get(k) != self.header[k]]
         if different:
             key = different[0]
@@ -109,7 +114,8 @@ class Checkpoint:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise ConfigurationError(f"{self.path}: the checkpoint cannot be written ({error.strerror}); make room, then resume") from None
+            words = f"the checkpoint cannot be written ({error.strerror}); make room, then resume"
+            raise ConfigurationError(f"{self.path}: {words}") from None
 
     def add(self, chunk: str, item: str, result) -> None:
         """Write a finished chunk; it is on the disk when this returns. `item`: digest; `result`: encoded."""

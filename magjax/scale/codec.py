@@ -58,7 +58,11 @@ def _absorb(state, value):
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (bool, int, float, complex, str, PurePath)):
-        _mark(state, type(value).__name__ if not isinstance(value, PurePath) else "path", repr(str(value) if isinstance(value, PurePath) else value))
+        _mark(
+            state,
+            type(value).__name__ if not isinstance(value, PurePath) else "path",
+            repr(str(value) if isinstance(value, PurePath) else value),
+        )
     elif isinstance(value, bytes):
         _mark(state, "bytes", len(value))
         state.update(value)

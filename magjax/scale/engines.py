@@ -41,7 +41,7 @@ def engine(executor):
 
 def _given_up(name, chunk, words):
     return ConfigurationError(
-        f"{name}: chunk {chunk} {words}; the chunks before it are in the checkpoint, if one was given: give each worker more memory "
+        f"{name}: chunk {chunk} {words}; finished ones are in the checkpoint, if one was given: give each worker more memory "
         "(fewer --workers), then resume"
     )
 
@@ -214,4 +214,6 @@ class Dask:
         try:
             return self.library.Client(self.where, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise ConfigurationError(f"no dask scheduler answers at {self.where} ({error}); start one (dask scheduler) and give its address") from None
+            raise ConfigurationError(
+                f"no dask scheduler answers at {self.where} ({error}); start one (dask scheduler) and give its address"
+            ) from None

@@ -1,7 +1,8 @@
 """What runs inside a worker: JAX set up as in the process that asked, inputs unpickled once, a chunk at a time.
 
 BLAS gets one thread: it sums in another order with every number of threads, and workers would crowd each other's cores;
-XLA's own threads leave the sums alone. JAX must be in double precision before the inputs are unpickled: arrays would lose half their digits on the way in.
+XLA's own threads leave the sums alone. JAX must be in double precision before the inputs are unpickled: arrays would
+lose half their digits on the way in.
 """
 
 import os
@@ -10,14 +11,18 @@ import signal
 import sys
 import threading
 import uuid
+import zlib
 
 import threadpoolctl
 
 BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
 SETTINGS = (
-    "jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_default_matmul_precision", "jax_platforms",
-)  # fmt: skip
-
+    "jax_enable_x64",
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_default_matmul_precision",
+    "jax_platforms",
+)
 _TOKEN = uuid.uuid4().hex
 _opened: dict[str, object] = {}  # digest -> inputs of the job at hand; one at a time
 _guard = threading.Lock()
@@ -57,8 +62,8 @@ def settle_in(found: dict) -> None:
 
 
 def pack(inputs) -> bytes:
-    """Inputs with the settings that they need, and the process that packed them."""
-    return pickle.dumps((_home(), settings(), pickle.dumps(inputs)))
+    """Inputs with the settings that they need, and the process that packed them; compressed (bases are mostly zeros)."""
+    return pickle.dumps((_home(), settings(), zlib.compress(pickle.dumps(inputs), 1)))
 
 
 def _home():
@@ -74,7 +79,7 @@ def open_inputs(name: str, blob: bytes):
             if home != _home():  # else a thread of the process that asked, which keeps its own settings
                 settle_in(found)
             _opened.clear()
-            _opened[name] = pickle.loads(content)
+            _opened[name] = pickle.loads(zlib.decompress(content))
         return _opened[name]
 
 

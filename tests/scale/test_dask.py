@@ -16,7 +16,13 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # a cluster with a killed wor
 
 @pytest.fixture(scope="module")
 def cluster():
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made:
+    import dask
+
+    # one worker may die of a task, the second ends it (three by default: restarts take seconds)
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made,
+    ):
         yield made
 
 
@@ -35,7 +41,26 @@ def test_a_killed_worker_is_replaced(cluster, tmp_path):
     assert json.dumps(encode(outcome.results)) == json.dumps(encode(run_job(job()).results))
 
 
+def test_a_chunk_that_kills_every_worker_is_given_up(cluster):
+    with pytest.raises(ConfigurationError, match="item 2 ended every dask worker"):
+        run_job(job(works.fatal, count=3), f"dask:{cluster.scheduler_address}")
+
+
 def test_no_scheduler_there(monkeypatch):
     monkeypatch.setattr("magjax.scale.engines.PATIENCE", 0.5)
     with pytest.raises(ConfigurationError, match="no dask scheduler answers"):
         run_job(job(), "dask:tcp://127.0.0.1:9")
+
+
+def test_the_blind_suite_over_a_cluster(cluster, tmp_path):
+    """Cases that are done already: the cluster finds their results and runs none."""
+    from tests.blind.cases import make_case
+    from tests.blind.run import over_dask
+
+    rows = []
+    for number in (0, 2):
+        folder = tmp_path / make_case("dev", number).name
+        folder.mkdir()
+        rows.append({"name": folder.name, "status": 0, "seconds": 61.5})
+        (folder / "done.json").write_text(json.dumps(rows[-1]))
+    assert over_dask("dev", (0, 2), tmp_path, cluster.scheduler_address) == rows

@@ -26,7 +26,9 @@ def folders(tmp_path_factory, truth):
         folder.mkdir()
         rng = np.random.default_rng(k)
         for drive in SINES:
-            write_recording(folder / f"rec_{drive[0]:03d}.csv", record(truth.replace({"coil.R_eddy": resistance}), *drive, rng, "r"))
+            write_recording(
+                folder / f"rec_{drive[0]:03d}.csv", record(truth.replace({"coil.R_eddy": resistance}), *drive, rng, "r")
+            )
         (folder / "check_aside.csv").write_text("never read")
     (root / "broken").mkdir()
     text = (root / "rod0" / "rec_010.csv").read_text().splitlines()
@@ -83,7 +85,17 @@ def test_a_folder_without_bench(folders, quick):
 
 def test_on_the_command_line(folders, tmp_path, capsys):
     out, checkpoint = tmp_path / "out", tmp_path / "kept"
-    arguments = ["fit", "--fleet", str(folders / "rod1"), str(folders / "empty"), "--bench", "aa-050h", "--checkpoint", str(checkpoint), "--quiet"]
+    arguments = [
+        "fit",
+        "--fleet",
+        str(folders / "rod1"),
+        str(folders / "empty"),
+        "--bench",
+        "aa-050h",
+        "--checkpoint",
+        str(checkpoint),
+        "--quiet",
+    ]
     assert main([*arguments, "--out", str(out)]) == 4
     assert "1 fitted" in capsys.readouterr().out
     assert (out / "fleet.csv").exists() and (out / "fleet.nc").exists()
@@ -106,6 +118,23 @@ def test_intervals_on_the_command_line(folders, tmp_path, capsys):
     assert (out / "bootstrap.nc").exists()
 
 
+def test_a_fit_is_kept_where_its_intervals_fail(folders, tmp_path, capsys):
+    files = [str(p) for p in sorted((folders / "rod1").glob("rec_*.csv"))]
+    arguments = ["fit", *files, "--bench", "aa-050h", "--profile", "lambda_s", "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(arguments) == 2
+    assert "not free" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "fit.json").read_text())["converged"]
+
+
+def test_a_defect_is_a_row(folders, quick, monkeypatch):
+    def strange(*_, **__):
+        raise KeyError("unheard of")
+
+    monkeypatch.setattr("fitting.scale.fleet.fit", strange)
+    row = fit_fleet([folders / "rod0"], "aa-050h", choices=quick).rows[0]
+    assert row["status"] == "failed" and "KeyError" in row["message"] and "report" in row["message"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
@@ -114,6 +143,7 @@ def test_intervals_on_the_command_line(folders, tmp_path, capsys):
         (["fit", "a.csv", "--bench", "aa-050h", "--bootstrap", "1"], "2 or more"),
         (["fit", "--fleet", ".", "--bootstrap", "10"], "--fleet goes with"),
         (["fit", "a.csv", "--fleet", "."], "no recordings beside"),
+        (["fit", "--fleet", ".", "--check", "a.csv"], "check_"),
         (["fit", "--bench", "aa-050h"], "give recordings"),
         (["fit", "--fleet", "absent", "--bench", "aa-050h"], "no such folder"),
         (["sweep", "--workers", "-1"], "1 or more"),

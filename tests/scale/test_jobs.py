@@ -255,7 +255,9 @@ print(digest(run_job(job(works.products, count=1)).results))
 
 def test_the_numbers_do_not_depend_on_the_threads_of_blas():
     run = {"capture_output": True, "text": True, "cwd": ROOT, "check": True}
-    ended = [subprocess.run([sys.executable, "-c", THREADS], env={**os.environ, "OPENBLAS_NUM_THREADS": n}, **run).stdout for n in "12"]
+    ended = [
+        subprocess.run([sys.executable, "-c", THREADS], env={**os.environ, "OPENBLAS_NUM_THREADS": n}, **run).stdout for n in "12"
+    ]
     assert ended[0] == ended[1] and len(ended[0]) > 30
 
 
@@ -279,7 +281,22 @@ def test_digests_tell_contents_apart():
     actuator = load_bench("aa-050h").actuator()
     assert digest(actuator) == digest(load_bench("aa-050h").actuator())
     assert digest(actuator) != digest(actuator.replace({"coil.R_eddy": 70.0 * (1 + 1e-15)}))
-    different = [1, 1.0, "1", True, [1], {"1": 1}, None, b"1", np.ones(1), np.ones((1, 1)), [[1], []], [[], [1]], works.spectrum, works.fatal]
+    different = [
+        1,
+        1.0,
+        "1",
+        True,
+        [1],
+        {"1": 1},
+        None,
+        b"1",
+        np.ones(1),
+        np.ones((1, 1)),
+        [[1], []],
+        [[], [1]],
+        works.spectrum,
+        works.fatal,
+    ]
     assert len({digest(v) for v in different}) == len(different)
     code = "from magjax.bench import load_bench; from magjax.scale.codec import digest; import jax; jax.config.update('jax_enable_x64', True); print(digest(load_bench('aa-050h').actuator()))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True).stdout
