@@ -241,6 +241,8 @@ def campaign(options, arguments, command, live, say):
 
     bench = load_bench(options.bench)
     limit = bench.limits.get("current_A") if options.limit is None else options.limit
+    if limit is not None and not 0 < limit < float("inf"):
+        raise ConfigurationError(f"--limit = {limit:g}; give a number above zero")
     return Campaign(options.port, bench, output_folder(options.out), limit, dict(SETTINGS), provenance(command, arguments, bench.name),
                     options.baud, options.durable, options.give_up, say, live, options.amplifier)  # fmt: skip
 

@@ -135,6 +135,13 @@ def test_what_the_device_cannot_do_is_refused_before_anything_moves(emulate, stu
     assert "the device holds 65536" in capsys.readouterr().err and not list((tmp_path / "out").glob("*.mjlog"))
 
 
+@pytest.mark.parametrize("command", ["record", "investigate"])
+@pytest.mark.parametrize("limit", ["nan", "0", "-1", "inf"])
+def test_a_limit_that_is_none_is_refused(study, tmp_path, capsys, command, limit):
+    assert main([command, "/dev/ttyNONE", "--plan", str(study), "--out", str(tmp_path / "out"), "--limit", limit]) == 2
+    assert f"--limit = {limit}" in capsys.readouterr().err
+
+
 def test_a_plan_at_a_missing_port_is_status_5(study, tmp_path, capsys):
     assert main(["record", "/dev/ttyNONE", "--plan", str(study), "--out", str(tmp_path / "out")]) == 5
     assert "no such port" in capsys.readouterr().err

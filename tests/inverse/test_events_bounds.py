@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from magjax.effects import ExcessLoss, QuarticMagnetostriction, SecondMode, SensorLag
+from magjax.effects import ExcessLoss, QuarticMagnetostriction, SecondMode, SensorLag, TransportDelay
 from magjax.errors import ConfigurationError
 from magjax.inverse import PlainActuator, PlainPreisach, current_for_displacement, implicit_euler
 from magjax.inverse.bounds import backward_bound, forward_bound, simulated_worst, static_bound
@@ -142,6 +142,7 @@ CASES = [
     (QuarticMagnetostriction(b=0.3), False),
     (SecondMode(gain=0.4, f2=600.0, xi2=0.1), False),
     (SensorLag(tau=3e-4, order2=0.5), True),
+    (TransportDelay(tau=3e-4), True),
 ]
 
 

@@ -251,3 +251,18 @@ def test_a_bad_trajectory_is_one_line_and_writes_nothing(tmp_path, capsys, conte
     assert main(["invert", str(path), "--out", str(tmp_path / "current.csv")]) == 3
     text = capsys.readouterr().err
     assert words in text and text.count("\n") == 1 and [f.name for f in tmp_path.iterdir()] == [path.name]
+
+
+def test_what_is_not_compensated_is_named(tmp_path, capsys, monkeypatch):
+    import magjax.inverse.command as command
+    from magjax.cli import main
+    from magjax.effects import Backlash, SensorLag
+
+    known = actuator(12).with_effect(AmplifierLag(tau=1e-4)).with_effect(SensorLag(tau=1e-4)).with_effect(Backlash())
+    monkeypatch.setattr(command, "load_actuator", lambda bench, model: known)
+    t = 1e-4 * np.arange(300)
+    wanted = np.stack([t, 33.0 + 3.0 * np.sin(2 * np.pi * 20 * t) * np.minimum(1, t / 0.02)], axis=1)
+    np.savetxt(tmp_path / "w.csv", wanted, delimiter=",", header="time_s,displacement_um", comments="")
+    for options, left in (([], ["sensor_lag", "backlash"]), (["--of-reading"], ["backlash"])):
+        assert main(["invert", str(tmp_path / "w.csv"), "--out", str(tmp_path / "c.csv"), *options]) == 0
+        assert f"not compensated: {', '.join(left)}" in capsys.readouterr().out
