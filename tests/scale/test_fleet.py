@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from fitting.demo import record
 from fitting.scale import fit_fleet
 from magjax.cli import main
+from magjax.cli.pages.commands import parser_of
 from magjax.errors import ConfigurationError
 from magjax.model_file import load_model
 from magjax.writers import write_recording
@@ -153,3 +155,11 @@ def test_wrong_use_is_one_line(arguments, word, capsys):
     assert main(arguments) == 2
     message = capsys.readouterr().err
     assert word in message and message.count("\n") == 1
+
+
+def test_the_commands_of_the_page_parse():
+    page = (Path(__file__).resolve().parents[2] / "docs" / "scale.md").read_text()
+    lines = [line.split()[1:] for line in page.splitlines() if line.startswith("    magjax ")]
+    assert len(lines) == 4
+    for command, *arguments in lines:
+        parser_of(command).parse_args(arguments)
