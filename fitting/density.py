@@ -10,6 +10,8 @@ import dataclasses
 import numpy as np
 
 R_EXPONENT = 1.6
+TAIL = 0.5
+RIDGE = 0.3  # beside second differences
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +74,8 @@ def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: i
     area = sum(c.sum() for c in columns)
     columns = [c / area for c in columns]
     main = len(columns)
-    once = _hats(low + step * (np.arange(level) + 0.5), np.linspace(low, high, max(6, knots_s // 2)))
+    once_knots = np.linspace(low, high, max(6, knots_s // 2))
+    once = _hats(low + step * (np.arange(level) + 0.5), once_knots)
     for place in ((slice(1, -1), 0), (-1, slice(1, -1))):
         for k in range(once.shape[1]):
             mass = np.zeros((size, size))
@@ -86,13 +89,37 @@ def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: i
     penalties = [
         _differences([[number.get((a + d, b)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
         _differences([[number.get((a, b + d)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
-        _differences(_triples(main, once.shape[1]) + _triples(main + once.shape[1], once.shape[1]), cells.shape[1], ridge=range(main, once_end)),
+        np.concatenate(
+            [
+                _differences(_triples(main, once.shape[1]) + _triples(main + once.shape[1], once.shape[1]), cells.shape[1]),
+                RIDGE * _continuation(low, high, once_knots, s_knots, r_knots, number, main, refine**2 * level / (area * step), cells.shape[1]),
+            ]
+        ),
     ]
     if reversible:
         penalties.append(_differences(_triples(once_end, knots_s), cells.shape[1]))
     flat = np.ones(cells.shape[1])
     flat[main:] = 0.05
     return DensityBasis(low - step, high + step, size, cells, tuple(penalties), total, flat, knots_s, knots_r)
+
+
+def _continuation(low, high, once_knots, s_knots, r_knots, number, main, scale, unknowns):
+    """Rows that hold the once-switching relays to what the density at the edge of the plane lets expect beyond it.
+
+    A tail that falls as the square of the coercive field holds the edge's density times the distance from the diagonal, an
+    exponential one less: TAIL is half of it.
+    """
+    rows = []
+    for side, distance in ((0, once_knots - low), (1, high - once_knots)):
+        edge = (once_knots + (low, high)[side]) / 2
+        hats_s, hats_r = _hats(edge, s_knots), _hats(distance / 2, r_knots)
+        for k in range(len(once_knots)):
+            row = np.zeros(unknowns)
+            row[main + side * len(once_knots) + k] = 1.0
+            for (a, b), j in number.items():
+                row[j] = -TAIL * distance[k] * scale * hats_s[k, a] * hats_r[k, b]
+            rows.append(row)
+    return np.stack(rows)
 
 
 def _hats(x, knots):
@@ -115,7 +142,7 @@ def _differences(triples, unknowns, ridge=()):
             rows.append(row)
     for k in ridge:
         row = np.zeros(unknowns)
-        row[k] = 0.3
+        row[k] = RIDGE
         rows.append(row)
     return np.stack(rows)
 

@@ -17,6 +17,7 @@ from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 FINER_KNOTS = ((26, 18), (36, 24))
 FINER_TAKES = 0.7  # of the excess may be left
 REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
+CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
@@ -70,11 +71,15 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
             problem, z = build_problem(spectra, actuator, bench, names, tried, start)
         weights = START_WEIGHTS[: len(problem.layout.penalties)]
         solution = solve(problem, z, weights, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
-        if best is None or solution.chi2 < best[1].chi2:
-            best = (problem, solution, tried)
-        if best[1].chi2 < REST_SETTLED * problem.data_count:
+        levels = solution.z[len(solution.z) - problem.layout.memories :]
+        score = solution.chi2 + float(levels @ levels)
+        if best is None or score < best[3]:
+            best = (problem, solution, tried, score)
+        # levels that strain their prior tell of a wrong start memory even where the recordings are met
+        calm = float(levels @ levels) <= CALM * len(levels)
+        if calm and solution.chi2 < REST_SETTLED * problem.data_count:
             break
-    return best
+    return best[:3]
 
 
 def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report):

@@ -181,6 +181,6 @@ def wrong_bench(result) -> str | None:
         if len(s.reading) > 1 and abs(s.drive[1]) > 0:
             correlation.append(np.angle(s.reading[1] / s.drive[1]))
     slow = [c for c, s in zip(correlation, result.spectra, strict=True) if s.frequency <= min(x.frequency for x in result.spectra) * 1.01]
-    if slow and all(abs(c) > 0.75 * np.pi for c in slow) and result.chi2_per_sample > 20:
+    if slow and all(abs(c) > 0.75 * np.pi for c in slow) and not result.chi2_per_sample <= 20:  # a fit that broke down too
         return "the reading falls where the drive rises at the lowest frequency: the sign of a channel is swapped; set scale = -1 in [columns]"
     return None

@@ -94,7 +94,7 @@ def inferred_loops(spectra, deviations, actuator, samples: int = 200):
             M = float(actuator.magnetostriction.M_s) * unfold(np.sqrt(np.maximum(free, 0.0) / scale), applied)
             rate = np.gradient(np.concatenate([M[-2:], M, M[:2]]))[2:-2] * samples * s.frequency
             H = applied - float(coil.loss) * MU0 * rate
-            trust = np.abs(M) / np.abs(M).max()
+            trust = np.abs(M) / max(np.abs(M).max(), 1e-300)
         else:
             B = evaluate_lines(lines, phases)
             H = applied - float(coil.loss) * evaluate_lines(lines * w, phases)
