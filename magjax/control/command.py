@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ConfigurationError
+from ..inverse.command import write_table
 from .l1 import TrackingProblem, design, knee
 from .problem import M_S, rod, weight
 from .realize import reduced_controller
@@ -50,7 +51,7 @@ def design_summary(plant, options, folder) -> dict:
         f"order {controller.order} on its model; {margins}.{warning}"
     )
     if folder is not None:
-        (folder / "design.json").write_text(json.dumps(summary, indent=1))
+        _write_json(folder / "design.json", summary)
         if options.figures:
             summary["figures"] = str(design_figures(plant, options, folder))
             summary["message"] += f" Wrote {folder}/design.json and {summary['figures']}."
@@ -59,6 +60,12 @@ def design_summary(plant, options, folder) -> dict:
     elif options.figures:
         raise ConfigurationError("--figures needs a folder; add --out DIR")
     return summary
+
+
+def _write_json(path, content):
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    partial.replace(path)
 
 
 def design_figures(plant, options, folder) -> Path:
@@ -119,11 +126,7 @@ def simulate_summary(plant, options) -> dict:
     run = track(plant, plant, time, wanted, options.strategy, options.u_bar)
     rms, largest = run.errors()
     out = Path(options.out)
-    try:
-        table = np.stack([run.time, run.wanted, run.reached, run.current], axis=1)
-        np.savetxt(out, table, delimiter=",", header="time_s,wanted_m,reached_m,current_A", comments="", fmt="%.10g")
-    except OSError as error:
-        raise ConfigurationError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+    write_table(out, [run.time, run.wanted, run.reached, run.current], "time_s,wanted_m,reached_m,current_A")
     text = f"{options.strategy} at T = {time[1] - time[0]:.4g} s: rms error {rms * 1e6:.3g} um, largest {largest * 1e6:.3g} um, "
     text += f"{run.saturated:.0%} of the samples at a limit; wrote {out}"
     return {"rms_m": rms, "largest_m": largest, "saturated": run.saturated, "file": str(out), "message": text}
@@ -157,7 +160,7 @@ def compare_summary(plant, options, folder, benches=None) -> dict:
         text += f"\n\nConcealed: {options.hide} {HIDDEN[options.hide]}; the diagnosis: {found['message']}"
     summary = {"rows": rows, "diagnosis": found, "message": text}
     if folder is not None:
-        (folder / "study.json").write_text(json.dumps(summary, indent=1))
+        _write_json(folder / "study.json", summary)
         _tracking_figure(plants, options, folder)
         summary["message"] += f"\n\nWrote {folder}/study.json and {folder}/tracking.png."
     return summary

@@ -1,5 +1,6 @@
 """What `magjax invert` does: a wanted displacement in a file to the current in a file."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -27,19 +28,11 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
             f"{trajectory}: no sample can be reached ({1e6 * wanted.min():.4g} .. {1e6 * wanted.max():.4g} um are wanted, "
             f"the actuator moves between 0 and {stroke:.4g} um); check unit and zero"
         )
-    out = Path(out)
-    if out.is_dir():
-        raise ConfigurationError(f"{out}: is a folder; give the name of a file in it")
-    partial = out.with_name(out.name + ".part")
-    try:
-        columns, names = [time, current], "time_s,current_A"
-        if infeasible.any():
-            columns.append(nearest_feasible(plant, undo_sensor(plant, wanted, h) if of_reading else wanted, h))
-            names += ",displacement_m"
-        np.savetxt(partial, np.stack(columns, axis=1), delimiter=",", header=names, comments="", fmt="%.12g")
-        partial.replace(out)
-    except OSError as error:
-        raise ConfigurationError(f"{out}: cannot be written ({error.strerror}); choose another --out") from None
+    columns, names = [time, current], "time_s,current_A"
+    if infeasible.any():
+        columns.append(nearest_feasible(plant, undo_sensor(plant, wanted, h) if of_reading else wanted, h))
+        names += ",displacement_m"
+    write_table(out, columns, names)
     known = (*KNOWN_INVERSES, *(SENSOR_INVERSES if of_reading else ()))
     left = [e for e in plant.effects if e not in known]
     text = f"current {current.min():.4g} .. {current.max():.4g} A; wrote {out}"
@@ -58,6 +51,21 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
         "not_compensated": left,
         "message": text,
     }
+
+
+def write_table(out, columns, names: str) -> None:
+    """Columns as CSV, whole or not at all; raises `ConfigurationError` where that cannot be."""
+    out = Path(out)
+    if out.is_dir():
+        raise ConfigurationError(f"{out}: is a folder; give the name of a file in it")
+    partial = out.with_name(out.name + ".part")
+    try:
+        np.savetxt(partial, np.stack(columns, axis=1), delimiter=",", header=names, comments="", fmt="%.12g")
+        partial.replace(out)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise ConfigurationError(f"{out}: cannot be written ({error.strerror or error}); choose another --out") from None
 
 
 def load_actuator(bench, model):

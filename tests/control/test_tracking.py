@@ -148,6 +148,20 @@ def test_commands(tmp_path, capsys, monkeypatch):
     )
 
 
+def test_nothing_is_left_half_written(tmp_path, capsys, monkeypatch):
+    """A disk that fills while the table is written: one line, no file."""
+    import magjax.inverse.command as writing
+
+    def full(path, *rest, **options):
+        path.write_text("time_s")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(writing.np, "savetxt", full)
+    for out in ("track.csv", "."):
+        status, said = command(["simulate", "--strategy", "dynamic_inverse", "--out", str(tmp_path / out)], capsys)
+        assert status == 2 and said.err.count("\n") == 1 and list(tmp_path.iterdir()) == []
+
+
 def test_command_errors_are_one_line(capsys):
     wrong = (
         (["fly"], "no action"),
