@@ -37,12 +37,6 @@ def _run_sharded(run, model, rows, mesh, options):
     def own_share(values, *own):
         return run(eqx.combine(values, rest), *own, **dict(options))
 
-    return _shard_map(own_share, mesh, (whole, *(split for _ in rows)), split)(numbers, *rows)
-
-
-def _shard_map(function, mesh, into, out):
-    if hasattr(jax, "shard_map"):
-        return jax.shard_map(function, mesh=mesh, in_specs=into, out_specs=out, check_vma=False)
-    from jax.experimental.shard_map import shard_map  # jax 0.6
-
-    return shard_map(function, mesh=mesh, in_specs=into, out_specs=out, check_rep=False)
+    return jax.shard_map(own_share, mesh=mesh, in_specs=(whole, *(split for _ in rows)), out_specs=split, check_vma=False)(
+        numbers, *rows
+    )
