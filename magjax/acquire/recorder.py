@@ -369,10 +369,9 @@ class Recorder:
                 step()
             except (DiskFull, Ended) as error:
                 status, reason = max(status, 6), reason if status else str(error)
-        zero = self.final is not None or bool(self.order.text is not None)
         summary = {
             "reason": reason, "status": status, "segments": self.segment + 1, **self.totals, "damaged_frames": self.adapter.damaged,
-            "drive_at_zero": "confirmed" if zero else f"by the device's watchdog ({self.hello.watchdog_s:g} s)", "path": str(self.order.path),
+            "drive_at_zero": self._drive(), "path": str(self.order.path),
         }  # fmt: skip
         if summary["lost"] and not status:
             summary["reason"] = f"done, {summary['lost']} samples lost"
@@ -384,6 +383,16 @@ class Recorder:
         shut(self.port)
         self.acknowledged = self.totals["received"]
         return {**summary, "acknowledged": self.acknowledged, "bytes": self.log.written}
+
+    def _drive(self) -> str:
+        """How the drive came to zero, in words."""
+        if self.order.text is not None:
+            return "not driven by magjax"
+        if self.final is not None:
+            return "confirmed"
+        if self.hello.watchdog_s:
+            return f"by the device's watchdog ({self.hello.watchdog_s:g} s)"
+        return "NOT CONFIRMED, and the device has no watchdog: switch the amplifier off"
 
     def _progress(self):
         known = self.tracker.known_lost if self.tracker else 0

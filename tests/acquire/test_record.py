@@ -201,6 +201,7 @@ def test_a_text_line_device_is_recorded(tmp_path):
         writer.join()
         os.close(master)
     assert end["status"] == 0 and end["received"] > 1000 and not end["tail_known"], end
+    assert end["drive_at_zero"] == "not driven by magjax"
     (recording,) = load_recordings([tmp_path / "t.mjlog"], "aa-050h")
     assert recording.dt == pytest.approx(1e-4, rel=1e-3) and recording.channels["current"].max() == pytest.approx(0.5, rel=1e-3)
 
@@ -354,3 +355,15 @@ def test_bad_input_is_one_line(emulate, tmp_path, capsys):
     assert (tmp_path / "tty").read_text() == "a file of the user's"
     assert main(["ports", "--json"]) == 0
     json.loads(capsys.readouterr().out)
+
+
+def test_of_two_recorders_on_one_port_one_records(emulate, tmp_path):
+    port = emulate()["port"]
+    command = [sys.executable, "-m", "magjax", "record", port, "--frequency", "10", "--quiet", "--out"]
+    both = [subprocess.Popen([*command, str(tmp_path / f"{k}.mjlog")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for k in range(2)]  # fmt: skip
+    said = sorted((child.communicate(timeout=120), child.returncode)[::-1] for child in both)
+    if said[1][0] == 0:  # so slow a start of the second that the first was done
+        return
+    assert [status for status, _ in said] == [0, 5] and "in use by" in said[1][1][1]
+    (log,) = [Log(path) for path in tmp_path.glob("*.mjlog")]
+    assert log.end["lost"] == 0 and log.samples == 6000

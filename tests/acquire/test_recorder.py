@@ -155,3 +155,18 @@ def test_a_link_that_breaks_in_the_handshake_is_one_line(bench):
 
     with pytest.raises(DeviceError, match="link broke before the device said HELLO"):
         bench(Dead(Device(PlainResponse()))).run()
+
+
+@pytest.mark.parametrize(("watchdog", "words"), [(2.0, "by the device's watchdog (2 s)"), (0.0, "NOT CONFIRMED")])
+def test_a_drive_that_may_still_run_is_not_called_zero(bench, watchdog, words):
+    class Deaf(MemoryPort):
+        def write(self, wire):
+            if not self.device.running:
+                super().write(wire)
+
+        def read(self, count):
+            return b"" if self.device.frames > 8 else super().read(count)
+
+    device = Device(PlainResponse(exact=True), watchdog_s=watchdog)
+    end = bench(Deaf(device), give_up_s=0.2, stop_wait_s=0.2).run()
+    assert end["status"] == 6 and "silent" in end["reason"] and words in end["drive_at_zero"]
