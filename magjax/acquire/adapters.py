@@ -76,9 +76,7 @@ class TextAdapter:
         rows, messages = [], []
         for line in lines:
             if line.startswith(b"#"):
-                fresh = _text_hello(line[1:].decode("ascii", "replace"))
-                if self.hello is None:
-                    self.hello = fresh
+                self._take_header(line[1:].decode("ascii", "replace").strip())
                 continue
             row = self._row(line)
             if row is not None:
@@ -90,6 +88,15 @@ class TextAdapter:
                 messages.append((p.DATA, p.Frame(int(rows[begin][0]), int(rows[begin][1]), block)))
                 begin = k
         return messages
+
+    def _take_header(self, text):
+        """The line of column names; other remarks of the device are passed over."""
+        if not text.startswith("seq"):
+            return
+        fresh = _text_hello(text)
+        if self.hello is not None and fresh.channels != self.hello.channels:
+            raise DeviceError(f"the device's columns are now {text}, which are not those of this recording; record anew")
+        self.hello = self.hello or fresh
 
     def _row(self, line):
         if not line.strip() or self.hello is None:

@@ -170,6 +170,9 @@ def test_text_lines():
     assert adapter.damaged == 3 and adapter.hello.channels[0].to_si(adapter.feed(b"12,0,2000,0\n")[0][1].counts[:, 0])[0] == 2.0
     with pytest.raises(DeviceError, match="colour"):
         TextAdapter("seq,t_us,colour_A")
+    assert adapter.feed(b"# warm, ready\n# seq,t_us,current_mA,displacement_um\n") == []
+    with pytest.raises(DeviceError, match="columns are now"):
+        adapter.feed(b"# seq,t_us,displacement_um,current_mA\n")
 
 
 def test_a_text_line_device_is_recorded(tmp_path):
