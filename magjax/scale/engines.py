@@ -17,6 +17,7 @@ from ..errors import ConfigurationError
 from .worker import begin, one_thread, pack, perform_opened, perform_packed
 
 TRIES = 3  # workers that one chunk may cost
+DASK_TRIES = 2  # times that a chunk is given to dask, which spends several workers on each
 PATIENCE = 10.0  # s, for a dask scheduler to answer
 KINDS = '"processes:N", "dask:ADDRESS", a dask.distributed Client or a concurrent.futures Executor'
 
@@ -172,17 +173,16 @@ class Foreign:
 class Dask:
     """A dask.distributed cluster, by address or by client. The scheduler gives a dead worker's chunk to another.
 
-    The inputs are the result of a task, so that the scheduler can make them again where their only holder died.
+    The inputs are the result of a task, so that the scheduler can make them again where their only holder died. dask
+    blames a death on every chunk that waited at the worker too, so a chunk that it gives up is given once more.
     """
-
-    lost = 0
 
     def __init__(self, where):
         try:
             import distributed
         except ImportError:
             raise ConfigurationError('a dask scheduler needs dask.distributed; type pip install "magjax[scale]"') from None
-        self.library, self.where = distributed, where
+        self.library, self.where, self.lost = distributed, where, 0
 
     def run(self, name, work, inputs, tasks):
         """See the module."""
@@ -191,22 +191,31 @@ class Dask:
         blob = pack(inputs)
         key = hashlib.sha256(blob).hexdigest()
         label = f"magjax-{key[:8]}-{uuid.uuid4().hex[:8]}"
-        futures = {}
+        shared, running = {}, {}
+
+        def give(number, attempt):
+            if attempt not in shared:
+                shared[attempt] = client.submit(bytes, blob, key=f"{label}-inputs-{attempt}")
+            _, item, entropy = tasks[number]
+            future = client.submit(perform_packed, work, key, shared[attempt], item, entropy, key=f"{label}-{number}-{attempt}")
+            running[future.key] = (future, number, attempt)
+            return future
+
         try:
-            shared = client.submit(bytes, blob, key=f"{label}-inputs")
-            for number, (chunk, item, entropy) in enumerate(tasks):
-                future = client.submit(perform_packed, work, key, shared, item, entropy, key=f"{label}-{number}", retries=0)
-                futures[future.key] = (chunk, future)
-            for future in self.library.as_completed([f for _, f in futures.values()], loop=client.loop):
-                chunk = futures[future.key][0]
+            completed = self.library.as_completed([give(number, 1) for number in range(len(tasks))], loop=client.loop)
+            for future in completed:
+                _, number, attempt = running.pop(future.key)
                 try:
                     result = future.result()
                 except self.library.scheduler.KilledWorker:
-                    raise _given_up(name, chunk, "ended every dask worker that it was given to") from None
-                yield chunk, result
-                future.release()
+                    self.lost += 1
+                    if attempt == DASK_TRIES:
+                        raise _given_up(name, tasks[number][0], "ended every dask worker that it was given to") from None
+                    completed.add(give(number, attempt + 1))
+                else:
+                    yield tasks[number][0], result
         finally:
-            client.cancel([f for _, f in futures.values() if not f.done()])
+            client.cancel([future for future, _, _ in running.values()])
             if own:
                 client.close()
 
