@@ -120,7 +120,8 @@ def test_intervals_on_the_command_line(folders, tmp_path, capsys):
     assert (out / "bootstrap.nc").exists()
 
 
-def test_a_fit_is_kept_where_its_intervals_fail(folders, tmp_path, capsys):
+def test_a_fit_is_kept_where_its_intervals_fail(folders, result, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("fitting.fit.fit", lambda *_, **__: result)
     files = [str(p) for p in sorted((folders / "rod1").glob("rec_*.csv"))]
     arguments = ["fit", *files, "--bench", "aa-050h", "--profile", "lambda_s", "--out", str(tmp_path / "out"), "--quiet"]
     assert main(arguments) == 2
