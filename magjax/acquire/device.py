@@ -10,6 +10,7 @@ import secrets
 
 import numpy as np
 
+from ..errors import MagjaxError
 from . import protocol as p
 
 DRIVE_SCALE = 5e-5  # A a count: +-1.6 A
@@ -82,7 +83,7 @@ class Device:
                 return [self._generate(payload)]
             if kind == p.START:
                 return [self._start(payload, now)]
-        except ValueError as error:
+        except (ValueError, MagjaxError) as error:
             return [p.ack_packet(kind, 1, 0, str(error))]
         return [p.ack_packet(kind, 1, 0, f"packet type {kind:#x} is unknown")]
 

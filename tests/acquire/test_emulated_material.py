@@ -90,3 +90,15 @@ def test_corners_are_wiped_out_and_few_keep_the_outermost():
     assert material.level(material.past, -3.0, 3.0) > material.level([], -3.0, 3.0) == 0
     material.run([9.9, -9.9])
     assert material.past == [-10.0, 9.9, -9.9, 0.0]
+
+
+def test_a_drive_that_the_model_does_not_bear_is_refused_by_the_device(bench):
+    box = Device(BenchResponse(bench, {"mean_field": {}}), noise=False)
+    box.receive(p.generate_packet(WIDTH, 0, round(0.6 / DRIVE_SCALE), 0, 1.0), 0.0)
+    ack = p.read_ack(box.receive(p.start_packet(1, RATE, WIDTH), 0.0)[0])
+    assert ack.status and "outside the Preisach plane" in ack.text and not box.running and box.drive_now() == 0
+
+
+def test_a_displacement_read_late(bench):
+    prompt, late = (play(Device(BenchResponse(bench, {}, shift=s), noise=False), 0.4)[-WIDTH:] for s in (0.0, 5 / RATE))
+    assert np.allclose(late[:, 0], prompt[:, 0]) and np.abs(late[:, 1] - np.roll(prompt[:, 1], 5)).max() < 4e-9
