@@ -5,7 +5,6 @@ are there; so periods need not divide the sampling, and a gap needs no interpola
 """
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from .errors import RecordingError
 from .recording import fundamental
@@ -76,6 +75,8 @@ def merge_captures(captures, bench, path):
     resampled to a common grid by cubic splines. A pick-up coil's emf loses its mean in each period, so that its integral
     closes. Returns (columns, samples filled); raises `RecordingError` where a capture is not periodic or not uniform.
     """
+    from scipy.interpolate import CubicSpline
+
     drive = bench.drive
     grids, frequencies = [], []
     for k, capture in enumerate(captures):
