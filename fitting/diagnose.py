@@ -14,7 +14,7 @@ from magjax.effects import CATALOGUE
 from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, STRUCTURES, TIE, chi2_of, confidence, leaders, rivals_of, try_effect
 from .check import check_errors
 from .experiments import next_experiment
-from .fit import REFINE_BETWEEN, fit
+from .fit import REFINE_BETWEEN, REST_SETTLED, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
 from .locate import where
 from .screen import offset_score, screen
@@ -211,18 +211,24 @@ def _backward(recordings, bench, state, chosen, count, progress):
 
 
 def _finer(recordings, bench, current, best, good, chosen, excess, progress):
-    """Where the best still leaves a little and a finer density takes it: the tied rivals again on that density."""
-    if chosen.knots is None or not REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BETWEEN[1]:
-        return best, good, chosen
+    """The best with another start memory and with a finer density where it still leaves something: both were chosen under
+    the misfit of the base. Where that changes them, the near rivals are tried again on the same."""
     names = tuple(e.name for e in best.result.estimates if e.name.startswith("effects."))
-    finer = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=chosen, refine=True, progress=progress).choices
-    if finer == chosen:
+    found = chosen
+    if bench.start == "auto" and best.result.chi2_per_sample > REST_SETTLED:
+        free = dataclasses.replace(chosen, rest="auto")
+        other = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=free, refine=False, progress=progress)
+        if chi2_of(other) < chi2_of(best.result) - MIN_DROP:
+            found = other.choices
+    if chosen.knots is not None and REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BETWEEN[1]:
+        found = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=found, refine=True, progress=progress).choices
+    if found == chosen:
         return best, good, chosen
     classes = {c.name: c for c in CATALOGUE}
     near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
-    again = [try_effect(recordings, bench, current, t.candidate, classes[t.name], finer, excess, progress) for t in near]
+    again = [try_effect(recordings, bench, current, t.candidate, classes[t.name], found, excess, progress) for t in near]
     again = [t for t in again if t.physical] or [best]
-    return min(again, key=lambda t: chi2_of(t.result)), again, finer
+    return min(again, key=lambda t: chi2_of(t.result)), again, found
 
 
 def _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common) -> Diagnosis:

@@ -8,7 +8,7 @@ from .base import AbstractEffect
 
 
 class SecondMode(AbstractEffect):
-    """A further second-order mode in parallel, driven by the same force."""
+    """A further second-order mode in parallel, driven by the same force, which takes its share of the static displacement."""
 
     gain: Float[Array, ""] = param(0.0, "1", "static share of the second mode", scale=0.05, null=0.0, typical=(-0.5, 0.5))
     f2: Float[Array, ""] = param(1200.0, "Hz", "its frequency", low=0.0, scale=1200.0, shape=True, typical=(100.0, 5000.0))
@@ -16,7 +16,7 @@ class SecondMode(AbstractEffect):
 
     name = "second_mode"
     block = "mechanics"
-    law = "Y = (G(s) + gain G2(s)) U, G2 of f2, xi2, less its static part"
+    law = "Y = ((1 - gain) G(s) + gain G2(s)) U, G2 of f2, xi2"
     source = "modal superposition (D. J. Ewins, Modal Testing, 2000)"
     signature = "linear in the forcing: a resonance in the harmonics near f2, whichever drive makes them"
     amplitude = "gain"
@@ -26,6 +26,6 @@ class SecondMode(AbstractEffect):
         w2 = 2 * jnp.pi * self.f2
 
         def response(s):
-            return w2**2 / (s * s + 2 * self.xi2 * w2 * s + w2**2) - 1
+            return w2**2 / (s * s + 2 * self.xi2 * w2 * s + w2**2)
 
-        return displacement + self.gain * line.filter(free_displacement, response)
+        return displacement + self.gain * (line.filter(free_displacement, response) - displacement)

@@ -67,7 +67,7 @@ def implicit_euler(plant: PlainActuator, current, h: float, operator=None):
 def second_mode_force(plant: PlainActuator, displacement, h: float):
     """The free displacement that makes both modes together follow `displacement`, over the whole trajectory at once.
 
-    U = Y / (G + gain (G2 - 1)) on a padded FFT: at rest before, and smoothly on (point-mirrored) after the end.
+    U = Y / (G + gain (G2 - G)) on a padded FFT: at rest before, and smoothly on (point-mirrored) after the end.
     """
     mode = plant.effects["second_mode"]
     y = np.asarray(displacement, float)
@@ -78,9 +78,9 @@ def second_mode_force(plant: PlainActuator, displacement, h: float):
     s = 2j * np.pi * np.fft.rfftfreq(len(whole), h)
     w, w2 = 2 * np.pi * plant.f0, 2 * np.pi * mode["f2"]
     first = w**2 / (s * s + 2 * plant.xi * w * s + w**2)
-    second = w2**2 / (s * s + 2 * mode["xi2"] * w2 * s + w2**2) - 1
+    second = w2**2 / (s * s + 2 * mode["xi2"] * w2 * s + w2**2)
     quiet = np.abs(s) < 2 * np.pi * 20 * max(plant.f0, mode["f2"])  # beyond, differentiating twice only lifts rounding
-    U = np.where(quiet, np.fft.rfft(whole) / (first + mode["gain"] * second), 0.0)
+    U = np.where(quiet, np.fft.rfft(whole) / (first + mode["gain"] * (second - first)), 0.0)
     return np.fft.irfft(U, len(whole))[pad : pad + len(y)]
 
 
@@ -129,7 +129,7 @@ def nearest_feasible(plant: PlainActuator, displacement, h: float):
         if k:
             rod = oscillate(rod, free[k - 1], after, h, plant.f0, plant.xi)
             second = second if mode is None else oscillate(second, free[k - 1], after, h, mode["f2"], mode["xi2"])
-        reached.append(rod[0] + (0.0 if mode is None else mode["gain"] * (second[0] - after)))
+        reached.append(rod[0] + (0.0 if mode is None else mode["gain"] * (second[0] - rod[0])))
     return np.array(reached)
 
 

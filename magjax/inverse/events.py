@@ -41,7 +41,7 @@ class HeldCurrent:
     def displacement(self) -> float:
         """Displacement, m."""
         mode = self.plant.effects.get("second_mode")
-        return self.rod[0] if mode is None else self.rod[0] + mode["gain"] * (self.second[0] - self._free())
+        return self.rod[0] if mode is None else self.rod[0] + mode["gain"] * (self.second[0] - self.rod[0])
 
     @property
     def speed(self) -> float:
