@@ -64,7 +64,9 @@ class Investigation:
             self.state["spent_s"] = before + self.clock() - begin
             stopped = next((r for r in rows if r["status"] in (5, 130)), None)
             if stopped:
-                return self._end("interrupted" if stopped["status"] == 130 else "device", stopped["problems"][0])
+                if stopped["status"] == 130:
+                    return self._end("interrupted", "What was recorded is kept; the same command goes on where it ended.")
+                return self._end("device", stopped["problems"][0])
             if not any(e.name in files for e in [*first, *extra]):
                 why = next((r["problems"][0] for r in rows if r["problems"]), "the budget leaves no recording")
                 return self._end("no usable recording", f"Nothing fit to use was recorded: {why}.")
