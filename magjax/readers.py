@@ -221,6 +221,8 @@ def _find(path, table, quantity, column, required):
 def _one(name, columns, origin, bench) -> Recording:
     quasistatic = bench.columns.get("time", {}).get("quasistatic")
     count = len(columns[bench.drive])
+    if count < 2:
+        raise RecordingError(f"{name}: holds one sample only; record again, or check the columns and the split of the file")
     metadata = dict(origin["metadata"])
     if quasistatic:
         columns = _uniform_loop({**columns}, bench)

@@ -104,3 +104,10 @@ def test_measured_loop_families_load_closed(measured):
         for loop in loops:
             B = loop.channels["flux_density"]
             assert abs(B[0] - B[-1]) < 0.03 * np.ptp(B) and loop.frequency() == pytest.approx(1.0)
+
+
+def test_a_single_sample_is_told(tmp_path):
+    path = tmp_path / "one.csv"
+    path.write_text("time_s,current_A,displacement_m\n0,0.1,1e-5\n")
+    with pytest.raises(RecordingError, match="one sample only"):
+        load_recordings([path], load_bench("aa-050h"))
