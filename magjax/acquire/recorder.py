@@ -374,7 +374,7 @@ class Recorder:
             "drive_at_zero": self._drive(), "path": str(self.order.path),
         }  # fmt: skip
         if summary["lost"] and not status:
-            summary["reason"] = f"done, {summary['lost']} samples lost"
+            summary["reason"] = f"{reason}, {summary['lost']} samples lost"
         try:
             self.log.end(summary)
         except DiskFull:

@@ -170,3 +170,11 @@ def test_a_drive_that_may_still_run_is_not_called_zero(bench, watchdog, words):
     device = Device(PlainResponse(exact=True), watchdog_s=watchdog)
     end = bench(Deaf(device), give_up_s=0.2, stop_wait_s=0.2).run()
     assert end["status"] == 6 and "silent" in end["reason"] and words in end["drive_at_zero"]
+
+
+def test_losses_do_not_hide_why_it_ended(bench):
+    device = Device(PlainResponse(exact=True))
+    port = MemoryPort(device, instead=lambda payloads: payloads[1:] if device.frames < 12 else payloads)
+    end = bench(port, samples=0, max_s=0.3).run()
+    assert end["status"] == 0 and end["lost"] > 0
+    assert end["reason"] == f"the duration limit of 0.3 s is reached, {end['lost']} samples lost"
