@@ -27,7 +27,7 @@ CASES = [
     ("duffing_stiffness", {"k3": 0.03}, True),
     ("inductive_crosstalk", {"kappa": 3e-10}, False),
     ("rate_dependent_switching", {"gamma": 9.0, "rate0": 3.0}, True),
-    ("structural_damping", {"eta": 0.006}, False),
+    ("structural_damping", {"eta": 0.006, "dispersion": 0.0, "exponent": 1e-3}, False),
     ("stress_feedback", {"stiffness": 2e9}, False),
     ("magnetic_aftereffect", {"share": 0.006}, True),
 ]

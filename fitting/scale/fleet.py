@@ -74,13 +74,13 @@ class Fleet:
             return "actuator", np.asarray([np.nan if v is None else v for v in values], float)
 
         data = {k: column([r[k] for r in self.rows]) for k in FIXED[4:]}
-        data["status"] = ("actuator", np.asarray([r["status"] for r in self.rows], dtype=object))
-        data["message"] = ("actuator", np.asarray([r["message"] for r in self.rows], dtype=object))
+        data["status"] = ("actuator", np.asarray([r["status"] for r in self.rows], dtype=str))
+        data["message"] = ("actuator", np.asarray([r["message"] for r in self.rows], dtype=str))
         for name in self.parameter_names:
             for key, ending in (("value", ""), ("stderr", "_stderr")):
                 values = column([r["parameters"].get(name, {}).get(key) for r in self.rows])
                 data[name + ending] = (*values, {"units": self.unit(name)})
-        return xr.Dataset(data, coords={"actuator": np.asarray([r["name"] for r in self.rows], dtype=object)})
+        return xr.Dataset(data, coords={"actuator": np.asarray([r["name"] for r in self.rows], dtype=str)})
 
     def __str__(self):
         lines = [", ".join(f"{self.count(s)} {s}" for s in STATES) + f" of {len(self.rows)} actuators"]

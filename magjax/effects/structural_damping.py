@@ -8,14 +8,20 @@ from .base import AbstractEffect
 
 
 class StructuralDamping(AbstractEffect):
-    """Complex stiffness w0^2 (1 + i eta)."""
+    """Complex stiffness w0^2 (1 + loss), with the fractional Kelvin element loss = eta ((i w / w0)^a - 1) / sin(pi a / 2).
+
+    Its imaginary part hardly changes with frequency where the exponent a is small; a causal solid then stiffens as the
+    logarithm of frequency (dispersion 1). The classic constant loss factor does not (dispersion 0, a to 0). One for the mean.
+    """
 
     eta: Float[Array, ""] = param(0.0, "1", "loss factor", low=0.0, scale=0.02, null=0.0, typical=(0.001, 0.2))
+    dispersion: Float[Array, ""] = param(1.0, "1", "growth of the stiffness with frequency: 1 causal, 0 classic", scale=1.0, shape=True, typical=(0.0, 1.0))
+    exponent: Float[Array, ""] = param(0.05, "1", "order of the fractional derivative", low=0.0, scale=0.05, shape=True, typical=(0.01, 0.5))
 
     name = "structural_damping"
     block = "mechanics"
-    law = "G = w0^2 / (s^2 + 2 xi w0 s + w0^2 (1 + i eta))"
-    source = "R. E. D. Bishop, D. C. Johnson, The Mechanics of Vibration (1960): hysteretic damping"
+    law = "G = w0^2 / (s^2 + 2 xi w0 s + w0^2 (1 + eta ((i w/w0)^a - 1)/sin(pi a/2)))"
+    source = "R. E. D. Bishop, D. C. Johnson, The Mechanics of Vibration (1960): hysteretic damping; R. L. Bagley, P. J. Torvik, J. Rheol. 27 (1983) 201: fractional"
     signature = "a phase lag of every harmonic that stays at low frequency"
     amplitude = "eta"
 
@@ -24,7 +30,12 @@ class StructuralDamping(AbstractEffect):
 
         def change(s):
             base = actuator.mechanics.response(s)
-            loss = 1j * self.eta * (jnp.imag(s) > 0)
+            w = jnp.imag(s)
+            ratio = jnp.where(w > 0, w, 1.0) / (2 * jnp.pi * actuator.mechanics.f0)
+            quarter = 0.5 * jnp.pi * jnp.maximum(self.exponent, 1e-6)
+            power = ratio ** jnp.maximum(self.exponent, 1e-6)
+            stiffer = (power * jnp.cos(quarter) - 1) / jnp.sin(quarter)
+            loss = self.eta * (w > 0) * (1j * power + self.dispersion * stiffer)
             return -base * loss * base / (1 + loss * base)
 
         return displacement + line.filter(free_displacement, change)
