@@ -8,13 +8,14 @@ from .forces import with_force
 
 
 class DuffingStiffness(AbstractEffect):
-    """Cubic spring about the mean position: relative stiffness k3 ((y - mean)/l_ref)^2, l_ref = saturation displacement."""
+    """Spring that stiffens with the displacement: relative stiffness k3 r^2 (1 + k5 r^2), r = y / saturation displacement."""
 
     k3: Float[Array, ""] = param(0.0, "1", "relative stiffness added at saturation displacement", scale=0.1, null=0.0, typical=(-1.0, 2.0))
+    k5: Float[Array, ""] = param(0.0, "1", "its growth: relative stiffness k3 r^2 (1 + k5 r^2)", scale=1.0, shape=True, typical=(-1.0, 2.0))
 
     name = "duffing_stiffness"
     block = "mechanics"
-    law = "y'' + 2 xi w0 y' + w0^2 (y + k3 (y/l)^2 y) = w0^2 u"
+    law = "y'' + 2 xi w0 y' + w0^2 (y + k3 r^2 (1 + k5 r^2) y) = w0^2 u, r = y/l"
     source = "Duffing oscillator (A. H. Nayfeh, D. T. Mook, Nonlinear Oscillations, 1979)"
     signature = "odd distortion that follows y, not M, and shifts the resonance with amplitude"
     amplitude = "k3"
@@ -22,4 +23,9 @@ class DuffingStiffness(AbstractEffect):
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with the cubic spring, m."""
         reach = actuator.magnetostriction.reach
-        return with_force(displacement, lambda y: -self.k3 * (y / reach) ** 2 * y, line, actuator)
+
+        def spring(y):
+            square = (y / reach) ** 2
+            return -self.k3 * square * (1 + self.k5 * square) * y
+
+        return with_force(displacement, spring, line, actuator)
