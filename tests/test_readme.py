@@ -35,6 +35,7 @@ def follow(folder, kinds):
             readme.end(process)
 
 
+@pytest.mark.long
 def test_the_tour_in_order(folder):
     follow(folder, ("quick",))
 

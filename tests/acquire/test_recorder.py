@@ -173,8 +173,15 @@ def test_a_drive_that_may_still_run_is_not_called_zero(bench, watchdog, words):
 
 
 def test_losses_do_not_hide_why_it_ended(bench):
-    device = Device(PlainResponse(exact=True))
-    port = MemoryPort(device, instead=lambda payloads: payloads[1:] if device.frames < 12 else payloads)
+    device = Device(PlainResponse(exact=True), watchdog_s=1e6)  # its time runs as fast as it is read
+    dropped = []
+
+    def lossy(payloads):  # frames in the middle, well after the answer to START
+        if device.frames > 20 and len(dropped) < 3 and len(payloads) > 1:
+            dropped.append(payloads.pop(0))
+        return payloads
+
+    port = MemoryPort(device, instead=lossy)
     end = bench(port, samples=0, max_s=0.3).run()
     assert end["status"] == 0 and end["lost"] > 0
     assert end["reason"] == f"the duration limit of 0.3 s is reached, {end['lost']} samples lost"

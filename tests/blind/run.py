@@ -60,27 +60,12 @@ def diagnose(folder: Path, result: Path, limit: float) -> dict:
     return {"status": status, "seconds": round(time.time() - begin, 1), "peak_MB_so_far": round(memory), "last": words[-400:]}
 
 
-def job_case(inputs, number, rng):
-    """A case as a chunk of a job; done.json keeps it, so that the job needs no checkpoint."""
-    return run_case(inputs["suite"], number, Path(inputs["out"]))
-
-
-def over_dask(suite: str, numbers, out: Path, scheduler: str):
-    """done.json of the cases, run on a dask cluster whose workers have this checkout and see `out`."""
-    from magjax.scale import Chunk, Job, run_job
-
-    chunks = tuple(Chunk(f"case {n}", n) for n in numbers)
-    job = Job(f"blind {suite}", job_case, {"suite": suite, "out": str(out.resolve())}, chunks)
-    return run_job(job, f"dask:{scheduler}").results
-
-
 def main():
     """Check the seal, run what is not done, one line a case."""
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("suite", choices=list(SUITES))
     p.add_argument("--out", type=Path, default=Path("blind-results"))
     p.add_argument("--workers", type=int, default=1)
-    p.add_argument("--scheduler", help="dask scheduler that shares out the cases (in place of --workers and --until)")
     p.add_argument("--numbers", type=int, nargs="*", help="only these cases")
     p.add_argument("--until", type=float, default=float("inf"), help="start no case after this many seconds")
     options = p.parse_args()
@@ -88,11 +73,6 @@ def main():
         sys.exit(f"the labels of {options.suite} are not the sealed ones of {SEALS.name}: a case was changed after the seal")
     begin = time.time()
     numbers = range(size(options.suite)) if options.numbers is None else options.numbers
-
-    if options.scheduler:
-        for ended in over_dask(options.suite, numbers, options.out, options.scheduler):
-            print(ended["name"], ended["status"], ended.get("seconds", ""))
-        return
 
     def one(number):
         return (

@@ -53,7 +53,7 @@ def test_no_scheduler_there(monkeypatch):
 def test_the_blind_suite_over_a_cluster(cluster, tmp_path):
     """Cases that are done already: the cluster finds their results and runs none."""
     from tests.blind.cases import make_case
-    from tests.blind.run import over_dask
+    from tests.studies.blind_cluster import over_dask
 
     rows = []
     for number in (0, 2):

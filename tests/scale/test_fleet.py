@@ -47,6 +47,7 @@ def fleet(folders, quick, tmp_path_factory):
     return fit_fleet(sorted(folders.iterdir()), "aa-050h", choices=quick, checkpoint=checkpoint), checkpoint
 
 
+@pytest.mark.long
 def test_every_folder_is_a_row(fleet):
     found, _ = fleet
     assert [r["name"] for r in found.rows] == ["broken", "empty", "rod0", "rod1", "rod2"]
@@ -57,6 +58,7 @@ def test_every_folder_is_a_row(fleet):
     assert "3 fitted, 0 not converged, 2 failed of 5" in str(found)
 
 
+@pytest.mark.long
 def test_the_table(fleet):
     found, _ = fleet
     lines = found.csv().splitlines()
@@ -68,6 +70,7 @@ def test_the_table(fleet):
     assert list(data.status.values) == ["failed", "failed", "fitted", "fitted", "fitted"]
 
 
+@pytest.mark.long
 def test_resumed_and_changed(fleet, folders, quick):
     found, checkpoint = fleet
     again = fit_fleet(sorted(folders.iterdir()), "aa-050h", choices=quick, checkpoint=checkpoint)
@@ -78,6 +81,7 @@ def test_resumed_and_changed(fleet, folders, quick):
     (folders / "empty" / "rec.csv").unlink()
 
 
+@pytest.mark.long
 def test_a_folder_without_bench(folders, quick):
     row = fit_fleet([folders / "rod0"], choices=quick).rows[0]
     assert row["status"] == "failed" and "--bench" in row["message"]
@@ -85,6 +89,7 @@ def test_a_folder_without_bench(folders, quick):
         fit_fleet([folders / "notes.txt"], "aa-050h")
 
 
+@pytest.mark.long
 def test_on_the_command_line(folders, tmp_path, capsys):
     out, checkpoint = tmp_path / "out", tmp_path / "kept"
     arguments = [
@@ -108,6 +113,7 @@ def test_on_the_command_line(folders, tmp_path, capsys):
     assert [r["status"] for r in json.loads(capsys.readouterr().out)] == ["fitted", "failed"]
 
 
+@pytest.mark.long
 def test_intervals_on_the_command_line(folders, tmp_path, capsys):
     out = tmp_path / "out"
     files = [str(p) for p in sorted((folders / "rod1").glob("rec_*.csv"))]
@@ -129,6 +135,7 @@ def test_a_fit_is_kept_where_its_intervals_fail(folders, result, tmp_path, capsy
     assert json.loads((tmp_path / "out" / "fit.json").read_text())["converged"]
 
 
+@pytest.mark.long
 def test_a_defect_is_a_row(folders, quick, monkeypatch):
     def strange(*_, **__):
         raise KeyError("unheard of")

@@ -47,12 +47,14 @@ def test_the_scatter_is_that_of_repeated_noise(result, hundred):
     assert 0.5 < hundred.chi2.mean() / result.data_count < 1.0
 
 
+@pytest.mark.long
 def test_blocks_scatter_alike(result, hundred):
     blocks = bootstrap_intervals(result, 40, kind="blocks", seed=4)
     ratio = [blocks.deviation(n) / hundred.deviation(n) for n in blocks.names]
     assert 0.5 < np.mean(ratio) < 1.5  # four periods tell their own scatter to a third
 
 
+@pytest.mark.long
 def test_two_processes_give_the_same_draws_and_more_draws_go_on(result, hundred, tmp_path):
     path = tmp_path / "draws"
     twenty = bootstrap_intervals(result, 20, seed=4, executor="processes:2", checkpoint=path)
@@ -66,6 +68,7 @@ def test_two_processes_give_the_same_draws_and_more_draws_go_on(result, hundred,
     assert "30 draws" in str(thirty)
 
 
+@pytest.mark.long
 def test_settling_from_afar_ends_at_the_optimum(result):
     problem, weights = result.problem, result.refined.weights
     centre = settle(problem, result.refined.z, weights)

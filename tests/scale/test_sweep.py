@@ -53,6 +53,7 @@ data.to_netcdf(sys.argv[1], engine="h5netcdf")
 """
 
 
+@pytest.mark.long
 def test_several_devices(plain, tmp_path):
     """Three devices, chunks of four: one row is made up, each device holds two."""
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=3", "PYTHONPATH": str(ROOT)}
