@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from magjax.preisach.memory import nesting
+from magjax.extrema import nesting
 from magjax.simulate import simulate
 
 from .model import Predictor, predicted_lines

@@ -8,7 +8,7 @@ import numpy as np
 
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.param import parameters_of
-from magjax.preisach.memory import nesting
+from magjax.extrema import nesting
 
 from .density import cell_basis, hat_basis
 from .joint import Problem

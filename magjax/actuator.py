@@ -69,6 +69,12 @@ class Actuator(eqx.Module):
             changed = eqx.tree_at(where, changed, jnp.asarray(value, dtype=float))
         return changed
 
+    def remembering(self, history, raised: float = 0.0) -> "Actuator":
+        """The actuator after a history of fields, A/m, from negative saturation, with M `raised`, A/m, as by relays out of reach."""
+        h = self.hysteresis
+        state = (jnp.asarray(history, dtype=float), h.low, h.offset + raised)
+        return eqx.tree_at(lambda a: (a.hysteresis.history, a.hysteresis.rest, a.hysteresis.offset), self, state)
+
     def describe(self) -> str:
         """The parameters in words, a line each."""
         lines = [

@@ -15,7 +15,7 @@ from .chain import Timeline
 from .chain.coupled import magnetize
 from .constants import MU0
 from .errors import ConfigurationError
-from .preisach.memory import nesting
+from .extrema import nesting
 from .scale import Chunk, Job, run_job
 from .scale.devices import over_devices
 

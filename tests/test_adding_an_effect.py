@@ -56,6 +56,7 @@ def test_the_gradient_at_null_is_finite_and_not_zero(kind):
 def test_the_shared_table_takes_it(kind):
     shared.test_declares_what_the_documentation_needs(kind)
     shared.test_null_gradient_and_batch(kind)
+    assert issubclass(kind, AbstractEffect)
 
 
 def test_the_page_names_every_hook_and_its_own_lines():

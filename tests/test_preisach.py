@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from magjax.errors import ConfigurationError
 from magjax.preisach import Preisach, density_masses, forc_masses, relay_magnetization
-from magjax.preisach.memory import nesting, reduced_history
+from magjax.extrema import nesting, wiped
 from tests.oracle.slow import SlowPreisach
 
 LOW, HIGH = -1000.0, 2000.0
@@ -157,9 +157,9 @@ def test_lost_corner_is_told():
 
 
 def test_reduced_history_keeps_what_matters():
-    assert list(reduced_history([0, 5, 1, 3, 2])) == [0, 5, 1, 3, 2]
-    assert list(reduced_history([0, 5, 1, 3, 2, 4])) == [0, 5, 1, 4]
-    assert list(reduced_history([0, 5, 1, 6])) == [0, 6]
+    assert list(wiped([0, 5, 1, 3, 2])) == [0, 5, 1, 3, 2]
+    assert list(wiped([0, 5, 1, 3, 2, 4])) == [0, 5, 1, 4]
+    assert list(wiped([0, 5, 1, 6])) == [0, 6]
 
 
 def test_forc_masses_return_the_density():

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-NUMPY_ONLY = ("magjax/control", "magjax/inverse", "magjax/pickup.py", "magjax/recording.py", "magjax/readers.py", "magjax/writers.py", "magjax/inspection.py", "magjax/waveforms.py", "magjax/bench.py")
+NUMPY_ONLY = (
+    *("magjax/control", "magjax/inverse", "magjax/acquire"),
+    *(f"magjax/{name}.py" for name in "pickup recording readers writers inspection waveforms bench extrema".split()),
+)
 SOURCES = sorted([*ROOT.glob("magjax/**/*.py"), *ROOT.glob("fitting/**/*.py")])
 
 

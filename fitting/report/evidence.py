@@ -155,7 +155,7 @@ def _plane(result) -> dict:
 
 def steady(actuator, s):
     """`Signals` of one settled period on the recording's drive; the same compiled program for all plain drives."""
-    from magjax.preisach.memory import nesting
+    from magjax.extrema import nesting
     from magjax.simulate import simulate
 
     power = np.abs(s.drive[1:]) ** 2

@@ -7,22 +7,10 @@ number of corners; the first periods are simulated from the coarsest `MOST` corn
 
 import numpy as np
 
+from ..extrema import wiped
 from ..inverse.operator import PlainPreisach
 
 MOST = 16  # corners from which a transient is simulated: the number is fixed, so that one compiled program serves every run
-
-
-def wiped(fields) -> list[float]:
-    """The alternating extrema of a history of fields that still matter, oldest first, the present field last."""
-    stack: list[float] = []
-    for value in np.asarray(fields, float).ravel().tolist():
-        while len(stack) >= 2 and (value - stack[-1]) * (stack[-1] - stack[-2]) >= 0:
-            stack.pop()
-        while len(stack) >= 3 and abs(value - stack[-1]) >= abs(stack[-2] - stack[-1]):
-            del stack[-2:]
-        if not stack or value != stack[-1]:
-            stack.append(value)
-    return stack
 
 
 class Material:

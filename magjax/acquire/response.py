@@ -96,8 +96,6 @@ class BenchResponse:
 
     def _run(self, drive, rate, history=None, level=0.0):
         """(readings (time, 2), fields that the relays see (time,)) of a drive: periodic, or after a history; M raised by `level`."""
-        import equinox as eqx
-
         from ..simulate import simulate
 
         periodic = history is None
@@ -107,10 +105,7 @@ class BenchResponse:
             actuator = actuator.without_effect(effect.name)
         for effect in instant:
             actuator = actuator.with_effect(effect)
-        h = actuator.hysteresis
-        past = np.zeros(0) if periodic else history
-        actuator = eqx.tree_at(lambda a: (a.hysteresis.history, a.hysteresis.rest, a.hysteresis.offset), actuator,
-                               (past + 0 * h.low, h.low, h.offset + level))  # fmt: skip
+        actuator = actuator.remembering([] if periodic else history, level)
         signals = simulate(actuator, drive, 1 / rate, periodic=periodic)
         reading = np.asarray(signals.reading)
         if self.shift:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..errors import ConfigurationError
+from ..extrema import wiped
 
 
 class Memory(eqx.Module):
@@ -90,32 +91,6 @@ def apply_field(table, memory: Memory, field) -> Memory:
     return memory.move(rising, kept, field, m)
 
 
-def _wiping_stacks(fields):
-    """The alternating extrema that still matter after each field of a history (wiping-out property)."""
-    stack: list[float] = []
-    for value in np.asarray(fields, float).ravel():
-        while len(stack) >= 2 and (value - stack[-1]) * (stack[-1] - stack[-2]) >= 0:
-            stack.pop()
-        while len(stack) >= 3 and abs(value - stack[-1]) >= abs(stack[-2] - stack[-1]):
-            del stack[-2:]
-        if not stack or value != stack[-1]:
-            stack.append(value)
-        yield stack
-
-
-def reduced_history(fields) -> np.ndarray:
-    """The alternating extrema of a history that still matter, oldest first, as NumPy."""
-    stack: list[float] = []
-    for stack in _wiping_stacks(fields):
-        pass
-    return np.asarray(stack)
-
-
-def nesting(drive) -> int:
-    """How many pairs of extrema a drive can leave in the memory at once, with two to spare."""
-    return max((len(stack) for stack in _wiping_stacks(drive)), default=1) // 2 + 3
-
-
 def start_history(start, low: float, high: float, alternations: int = 24) -> np.ndarray:
     """The alternating extrema that make a named start state, oldest first, A/m, after negative saturation.
 
@@ -136,7 +111,7 @@ def start_history(start, low: float, high: float, alternations: int = 24) -> np.
         raise ConfigurationError(
             f'start = "{start}" is no start state; write "demagnetized", "negative_saturation", "positive_saturation" or a history'
         )
-    return reduced_history(np.append(low, history))[1:]
+    return np.asarray(wiped(np.append(low, history))[1:])
 
 
 def memory_after(table, history, corners: int) -> Memory:

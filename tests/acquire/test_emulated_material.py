@@ -5,10 +5,11 @@ import pytest
 
 from magjax.acquire import protocol as p
 from magjax.acquire.device import DRIVE_SCALE, Device
-from magjax.acquire.material import MOST, Material, wiped
+from magjax.acquire.material import MOST, Material
 from magjax.acquire.order import DECAY, DECAY_PERIODS, DECAY_WIDTH
 from magjax.acquire.response import BenchResponse
 from magjax.bench import load_bench
+from magjax.extrema import wiped
 from magjax.simulate import simulate
 
 WIDTH, RATE = 200, 4000.0

@@ -248,30 +248,36 @@ def kill_at(order, seconds, recording=True):
 
 
 def killed_at_random(emulate, order, count, durable):
-    """kill -9 at random moments: all acknowledged samples are in the log, and the device's watchdog ends the run."""
+    """kill -9 at random moments: (logs that lack acknowledged samples or are torn in more than one place, logs that hold some).
+
+    The device's watchdog must have ended the last run too.
+    """
     port = emulate("--watchdog", "1")["port"]  # the next recorder ends a run that is still on
     random = np.random.default_rng(count)
-    kept = 0
+    kept, wrong = 0, []
     for k in range(count):
         made = order(port, samples=0, durable=durable)
         made.path = made.path.replace("run.mjlog", f"run{k}.mjlog")
         acknowledged = kill_at(made, random.uniform(0.0, 0.7), recording=k % 4 > 0)
         if os.path.exists(made.path):
             log = verify(made.path)
-            assert log.samples >= acknowledged and len(log.damage) <= 1 and log.end is None
+            if log.samples < acknowledged or len(log.damage) > 1 or log.end is not None:
+                wrong.append((k, log.samples, acknowledged, log.damage))
             kept += acknowledged > 0
-    assert kept > 0.5 * count
     assert drive_at_zero(port, 1.2)
+    return wrong, kept
 
 
 def test_killed_at_random_moments(emulate, order):
-    killed_at_random(emulate, order, 4, False)
+    wrong, kept = killed_at_random(emulate, order, 4, False)
+    assert wrong == [] and kept > 2
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("durable", [False, True])
 def test_killed_at_a_hundred_random_moments(emulate, order, durable):
-    killed_at_random(emulate, order, 100, durable)
+    wrong, kept = killed_at_random(emulate, order, 100, durable)
+    assert wrong == [] and kept > 50
 
 
 def test_a_killed_recording_is_resumed(emulate, order, tmp_path):
