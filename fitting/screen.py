@@ -24,12 +24,14 @@ from .model import whitened
 from .uncertainty import UNDERSMOOTH
 
 SHAPE_GRIDS = {
+    "amplifier_lag": {"order2": (0.25,)},
     "excess_loss": {"rate_knee": (0.3, 10.0, 100.0)},
     "field_diffusion": {"tau": (5e-5, 2e-4, 8e-4, 3e-3)},
     "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3)},
     "rate_dependent_switching": {"rate0": (0.3, 10.0, 100.0)},
     "second_mode": {"f2": (150.0, 250.0, 400.0, 650.0, 900.0, 1300.0, 2000.0, 3000.0), "xi2": (0.02, 0.1)},
     "structural_damping": {"dispersion": (0.0, 1.0)},
+    "creep": {"shortest": (1e-4, 1e-2)},
     "coulomb_friction": {"v_s": (1e-5, 3e-4, 3e-3)},
     "sensor_lag": {"order2": (0.0, 0.5)},
     "sensor_nonlinearity": {"q3": (0.0,)},

@@ -1,25 +1,28 @@
 """mechanics: logarithmic creep of mounts and glue, proportional to the displacement."""
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..param import param
 from .base import AbstractEffect
 
-TIMES = (1e-2, 1e-1, 1.0, 10.0)
+LONGEST = 100.0  # s; slower creep is a rest that periodic recordings cannot show
 
 
 class Creep(AbstractEffect):
-    """A ladder of lags, one a decade, that adds displacement late."""
+    """Lags spread evenly over the logarithm of time, from `shortest` to 100 s, that add displacement late."""
 
     gain: Float[Array, ""] = param(0.0, "1", "displacement added per decade of time", low=0.0, scale=0.01, null=0.0, typical=(0.001, 0.1))
+    shortest: Float[Array, ""] = param(1e-3, "s", "time at which the creep begins", low=1e-5, scale=1e-3, shape=True, typical=(1e-4, 1e-1))
 
     name = "creep"
     block = "mechanics"
-    law = "Y = G U (1 + gain sum_i (1/(1 + s tau_i) - 1)), tau = 10 ms .. 10 s"
-    source = "logarithmic creep y ~ 1 + gamma log10 t (K. Kuhnen, H. Janocha, 1998)"
+    law = "Y = G U (1 + gain log10((1 + s shortest)/(1 + s 100 s)))"
+    source = "logarithmic creep y ~ 1 + gamma log10 t (K. Kuhnen, H. Janocha, 1998), by its continuous spectrum of lags"
     signature = "gain falls by the same amount each decade of frequency, with a small constant lag"
     amplitude = "gain"
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with creep, relative to its settled value, m."""
-        return displacement + self.gain * line.filter(displacement, lambda s: sum(1 / (1 + s * t) - 1 for t in TIMES))
+        late = line.filter(displacement, lambda s: jnp.log((1 + s * self.shortest) / (1 + s * LONGEST)) / jnp.log(10.0))
+        return displacement + self.gain * late

@@ -176,5 +176,7 @@ def current_for_displacement(plant: PlainActuator, displacement, h: float, of_re
         flux_rate = MU0 * rate
         current = current + e["k"] * flux_rate / (flux_rate**2 + e["rate_knee"] ** 2 + 1e-12) ** 0.25 / plant.c0
     if "amplifier_lag" in plant.effects:
-        current = current + plant.effects["amplifier_lag"]["tau"] * np.concatenate([[0.0], np.diff(current)]) / h
+        lag = plant.effects["amplifier_lag"]
+        change = lag["tau"] * np.diff(current, prepend=current[0]) / h
+        current = current + change + lag.get("order2", 0.0) * lag["tau"] * np.diff(change, prepend=change[0]) / h
     return current, infeasible, saturated

@@ -34,7 +34,7 @@ class HeldCurrent:
         self.operator = self.plant.operator.copy()
         self.field = self.plant.c0 * self._start + self.plant.H_bias
         self.operator.apply(self.field)
-        self.current = self._start
+        self.amplifier = [self._start, 0.0]  # its current and the rate of it
         self.rod, self.second, self.events = [self._free(), 0.0], [self._free(), 0.0], 0
 
     @property
@@ -78,15 +78,21 @@ class HeldCurrent:
         return self.displacement
 
     def _delivered(self, command, piece):
-        """Mean current over a piece behind the amplifier's lag."""
-        tau = self.plant.effects.get("amplifier_lag", {}).get("tau", 0.0)
+        """Mean current over a piece behind the amplifier's lag, from the integral of its equation."""
+        lag = self.plant.effects.get("amplifier_lag", {})
+        tau, order2 = lag.get("tau", 0.0), lag.get("order2", 0.0)
         if tau <= 0:
-            self.current = command
+            self.amplifier = [command, 0.0]
             return command
-        share = -math.expm1(-piece / tau)
-        mean = command + (self.current - command) * share * tau / piece
-        self.current += (command - self.current) * share
-        return mean
+        before, rate = self.amplifier
+        if order2 < 1e-3:  # one pole, a thousand times slower than the other
+            self.amplifier = [before - (command - before) * math.expm1(-piece / tau), 0.0]
+            order2 = 0.0
+        else:
+            root = math.sqrt(order2)
+            self.amplifier = oscillate(self.amplifier, command, command, piece, 1 / (2 * math.pi * tau * root), 0.5 / root)
+        now, later = self.amplifier
+        return command - (tau * (now - before) + order2 * tau * tau * (later - rate)) / piece
 
     def advance(self, current: float, duration: float) -> float:
         """Field and memory alone under a held current; returns the field, A/m."""

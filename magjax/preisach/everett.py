@@ -44,8 +44,10 @@ class EverettTable(eqx.Module):
 
     def __call__(self, alpha, beta):
         """T(alpha, beta), elementwise for alpha >= beta; exact for the piecewise-uniform measure."""
-        i, p = self.locate(alpha)
-        j, q = self.locate(beta)
+        return self.at(*self.locate(alpha), *self.locate(beta))
+
+    def at(self, i, p, j, q):
+        """T in row i and column j of the cells at local coordinates p and q, as `locate` gives them."""
         width = self.cells + 1
         flat = self.values.ravel()
         corner = i * width + j

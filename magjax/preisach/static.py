@@ -70,13 +70,38 @@ def static_path(field, low: float) -> StaticPath:
 def static_magnetization(masses, low, high, offset, path: StaticPath):
     """M along a path, A/m, (time,); differentiable in the masses."""
     table = everett_table(masses, low, high, offset)
-    total = path.corner_sign * table(path.corner_alpha, path.corner_beta)
-    step, ancestor = total, path.corner_parent
+    return _magnetization(table, path, _places(table, path))
+
+
+def _places(table, path):
+    """Cells and local coordinates of the corners and of the samples: what does not depend on the masses."""
+    return [(*table.locate(a), *table.locate(b)) for a, b in ((path.corner_alpha, path.corner_beta), (path.alpha, path.beta))]
+
+
+def _magnetization(table, path, places):
+    corners, samples = places
+    step, ancestor = path.corner_sign * table.at(*corners), path.corner_parent
     for _ in range(max(path.depth, 1).bit_length()):  # sums over the chain of older corners by doubling
         step, ancestor = step + jnp.where(ancestor == jnp.arange(len(ancestor)), 0.0, step[ancestor]), ancestor[ancestor]
-    return table.lowest + step[path.parent] + path.sign * table(path.alpha, path.beta)
+    return table.lowest + step[path.parent] + path.sign * table.at(*samples)
 
 
 def static_value_and_gradient(loss, low, high, offset, path: StaticPath):
-    """masses -> (loss(M), its gradient in all masses), compiled; `loss` takes M, (time,)."""
-    return jax.jit(jax.value_and_grad(lambda masses: loss(static_magnetization(masses, low, high, offset, path))))
+    """masses -> (loss(M), its gradient in all masses), compiled; `loss` takes M, (time,).
+
+    The path goes in as an argument: as a part of the program the compiler copies it many times over (0.7 GB for 1e6 samples).
+    """
+
+    @jax.jit
+    def run(masses, path, places):
+        return jax.value_and_grad(lambda m: loss(_magnetization(everett_table(m, low, high, offset), path, places)))(masses)
+
+    locate = jax.jit(lambda masses, path: _places(everett_table(masses, low, high, offset), path))
+    found = {}  # by level
+
+    def value_and_gradient(masses):
+        if masses.shape not in found:
+            found[masses.shape] = locate(masses, path)
+        return run(masses, path, found[masses.shape])
+
+    return value_and_gradient

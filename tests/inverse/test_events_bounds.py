@@ -220,3 +220,21 @@ def test_errors_of_a_fit_in_the_static_bound():
 
 def test_names_of_the_plain_actuator():
     assert {f.name for f in dataclasses.fields(PlainActuator)} >= {"R_eddy", "c0", "effects"}
+
+
+@pytest.mark.parametrize("order2", [0.0, 0.1, 0.25, 0.5])
+def test_the_mean_current_behind_an_amplifier_is_its_equation_integrated(order2):
+    plant = dataclasses.replace(PlainActuator.from_actuator(actuator(8)), effects={"amplifier_lag": {"tau": 3e-4, "order2": order2}})
+    events = HeldCurrent(plant, 0.2)
+    means = [events._delivered(0.7, 1e-4) for _ in range(6)]
+    t = np.linspace(0, 6e-4, 6001)
+    poles = np.roots([order2 * 9e-8, 3e-4, 1.0]) if order2 else np.array([-1 / 3e-4])
+    a = [1.0] if len(poles) == 1 else [poles[1] / (poles[1] - poles[0]), poles[0] / (poles[0] - poles[1])]
+    if len(poles) == 2 and abs(poles[0] - poles[1]) < 1e-3 * abs(poles[0]):
+        decay = np.exp(poles[0].real * t) * (1 - poles[0].real * t)
+    else:
+        decay = sum(c * np.exp(p * t) for c, p in zip(a, poles, strict=True)).real
+    exact = 0.7 - 0.5 * decay
+    wanted = [np.trapezoid(exact[k * 1000 : (k + 1) * 1000 + 1], dx=1e-7) / 1e-4 for k in range(6)]
+    assert np.allclose(means, wanted, rtol=0, atol=1e-7)  # of the trapezoid here
+    assert np.isclose(events.amplifier[0], exact[-1], atol=1e-9)

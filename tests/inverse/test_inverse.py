@@ -131,7 +131,8 @@ def test_engine_approaches_the_implicit_steps():
     assert errors[1] < 0.4 * errors[0] < 0.02 * plant.M_s
 
 
-def test_open_loop_tracking():
+@pytest.mark.parametrize("order2", [0.0, 0.25])
+def test_open_loop_tracking(order2):
     """The current for a wanted displacement makes the simulated actuator follow it."""
     act = actuator(25)
     plant = PlainActuator.from_actuator(act)
@@ -144,8 +145,8 @@ def test_open_loop_tracking():
     assert np.abs(y - wanted)[n // 4 :].max() < 0.3e-6
     import dataclasses
 
-    late = dataclasses.replace(plant, effects={"amplifier_lag": {"tau": 2e-4}})
-    behind = act.with_effect(AmplifierLag(tau=2e-4))
+    late = dataclasses.replace(plant, effects={"amplifier_lag": {"tau": 2e-4, "order2": order2}})
+    behind = act.with_effect(AmplifierLag(tau=2e-4, order2=order2))
     for model, better in ((plant, False), (late, True)):
         error = np.asarray(simulate(behind, current_for_displacement(model, wanted, h)[0], h).displacement) - wanted
         assert (np.abs(error[n // 4 : -20]).max() < 0.3e-6) == better
