@@ -23,7 +23,7 @@ OTHER_KEYS = {
     "fit": ("free", "output", "priors"),
 }
 COLUMN_KEYS = ("name", "scale", "offset", "unit", "split", "merge", "quasistatic", "emf_turns", "emf_area", "emf_sign", "bits", "gain_accuracy")
-QUANTITIES = ("time", "current", "field", "displacement", "flux_density", "magnetization", "voltage", "temperature", "strain", "stress")
+QUANTITIES = ("time", "current", "command", "field", "displacement", "reference", "flux_density", "magnetization", "voltage", "temperature", "strain", "stress")
 STARTS = ("auto", "demagnetized", "negative_saturation", "positive_saturation")
 
 

@@ -14,8 +14,10 @@ from .recording import Recording
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
     "current": {"A": 1.0, "mA": 1e-3},
+    "command": {"A": 1.0, "mA": 1e-3},
     "field": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3, "Oe": 1e3 / (4 * np.pi)},
     "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
+    "reference": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
     "flux_density": {"T": 1.0, "mT": 1e-3, "G": 1e-4},
     "magnetization": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3},
     "voltage": {"V": 1.0, "mV": 1e-3},
@@ -40,6 +42,23 @@ def load_recordings(paths, bench) -> list[Recording]:
     for path in paths:
         recordings += read_file(Path(path), bench)
     return recordings
+
+
+def load_calibrations(paths, bench) -> list[Recording]:
+    """Calibrations of the sensor: time, `reference` (the known displacement, m, by a reference sensor) and the reading.
+
+    Any periodic motion of the sensor, without a coil current. Raises `RecordingError` naming file, column and mend.
+    """
+    bench = load_bench(bench)
+    found = []
+    for path in map(Path, paths):
+        origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} if path.is_file() else {}
+        for table, metadata in _read_table(path):
+            wanted = ("time", "reference", bench.output)
+            columns = {q: _find(path, table, q, bench.columns.get(q, {}), required=True) for q in wanted}
+            time, channels, _ = bridge_gaps(columns["time"] - columns["time"][0], {q: columns[q] for q in wanted[1:]}, "reference")
+            found.append(Recording(time, channels, {}, {**origin, "metadata": {k: _number(v) for k, v in metadata.items()}}, path.name))
+    return found
 
 
 def read_columns(path: Path, bench, quantities) -> dict:
@@ -170,7 +189,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
     columns, available = {}, list(table)
     quantities = {bench.drive, bench.output, *[q for q in bench.columns if q != "time"]}
-    for quantity in ("time", "voltage", "temperature", "magnetization", "flux_density", "displacement", "current", "field"):
+    for quantity in ("time", "voltage", "temperature", "magnetization", "flux_density", "displacement", "current", "command", "field"):
         column = bench.columns.get(quantity, {})
         found = _find(path, table, quantity, column, required=quantity in (bench.drive, bench.output))
         if found is not None:
@@ -204,7 +223,10 @@ def _find(path, table, quantity, column, required):
         matches = [n for n in table if _parse(n)[0] == quantity]
         if not matches:
             if required:
-                usual = {"current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm"}.get(quantity, "flux_density_T")
+                usual = {
+                    "current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm", "time": "time_s",
+                    "reference": "reference_m",
+                }.get(quantity, "flux_density_T")  # fmt: skip
                 raise RecordingError(
                     f"{path}: no {quantity} column among {', '.join(table)}; name it {usual} or map it in [columns.{quantity}] of the bench"
                 )

@@ -7,12 +7,13 @@ import numpy as np
 from .errors import ConfigurationError
 
 NAMES = {
-    "current": "current_A", "field": "field_A_per_m", "displacement": "displacement_m", "flux_density": "flux_density_T",
-    "magnetization": "magnetization_A_per_m", "voltage": "voltage_V", "temperature": "temperature_degC",
+    "current": "current_A", "command": "command_A", "field": "field_A_per_m", "displacement": "displacement_m", "reference": "reference_m",
+    "flux_density": "flux_density_T", "magnetization": "magnetization_A_per_m", "voltage": "voltage_V", "temperature": "temperature_degC",
 }  # fmt: skip
 UNITS = {
-    "current": "A", "field": "A/m", "displacement": "m", "flux_density": "T", "magnetization": "A/m", "voltage": "V", "temperature": "degC"
-}
+    "current": "A", "command": "A", "field": "A/m", "displacement": "m", "reference": "m", "flux_density": "T", "magnetization": "A/m",
+    "voltage": "V", "temperature": "degC",
+}  # fmt: skip
 
 
 def write_recording(path, recording) -> None:

@@ -5,13 +5,9 @@ rival. Both are fitted to the fundamentals of all recordings; what is left is to
 """
 
 import numpy as np
-from scipy.optimize import least_squares
 
+from ..instruments import SOURCE_LAWS, fit_laws, judge_laws
 from .log import read_log
-
-Z_FOUND = 6.0
-RIVAL = 10.0  # of chi2
-MODELS = {"amplifier_lag": lambda w, tau: 1 / (1 + 1j * w * tau), "delay": lambda w, tau: np.exp(-1j * w * tau)}
 
 
 def fundamental_gain(table: dict, metadata: dict):
@@ -47,41 +43,13 @@ def check_source(files) -> dict | None:
     if len(found) < 2:
         return None
     w, gain, error = (np.array([f[k] for f in found]) for k in (1, 2, 3))
-    fits = {name: _fit(model, w, gain, error) for name, model in MODELS.items()}
-    name = min(fits, key=lambda n: fits[n]["chi2"])
-    best, rival = fits[name], max(fits.values(), key=lambda f: f["chi2"])
-    count = 2 * len(found) - 2
-    z = best["tau"] / best["stderr"]
-    if abs(z) < Z_FOUND:
-        verdict = "follows" if best["chi2"] < 5 * count + 20 else "unknown"
-    elif best["chi2"] > 25 * count + 50:
-        verdict = "unknown"
-    else:
-        verdict = name if rival["chi2"] - best["chi2"] > RIVAL else "group"
-    turned = np.abs(np.angle(gain / best["gain"])) / error
+    verdict, best, rival = judge_laws(fit_laws(w, gain, error, SOURCE_LAWS))
+    turned = np.abs(np.angle(gain / best.gain)) / error
     order = np.argsort(-turned)
     decided = [{"file": found[k][0], "frequency_Hz": float(w[k] / 2 / np.pi), "phase_deg": float(np.degrees(np.angle(gain[k]))), "z": float(turned[k])}
                for k in order]  # fmt: skip
+    tau, stderr = best.parameters["tau"]
     return {
-        "verdict": verdict, "tau": best["tau"], "stderr": best["stderr"], "z": float(z), "gain": best["gain"], "chi2": best["chi2"],
-        "numbers": count, "rival_chi2": rival["chi2"], "decided_by": decided,
+        "verdict": verdict, "tau": tau, "stderr": stderr, "z": best.z, "gain": best.gain, "chi2": best.chi2,
+        "numbers": best.numbers, "rival_chi2": rival, "decided_by": decided,
     }  # fmt: skip
-
-
-def _fit(model, w, gain, error):
-    scale = 1 / w.max()
-
-    def residual(x):
-        miss = (x[0] * model(w, x[1] * scale) - gain) / error
-        return np.concatenate([miss.real, miss.imag])
-
-    result = least_squares(residual, [float(np.abs(gain).mean()), 0.01], x_scale=[1e-2, 1e-2])
-    covariance = np.linalg.inv(result.jac.T @ result.jac)
-    chi2 = float(2 * result.cost)
-    widen = np.sqrt(max(chi2 / max(2 * len(w) - 2, 1), 1.0))
-    return {
-        "tau": float(result.x[1] * scale),
-        "stderr": float(np.sqrt(covariance[1, 1]) * scale * widen),
-        "gain": float(result.x[0]),
-        "chi2": chi2,
-    }
