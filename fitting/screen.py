@@ -32,7 +32,7 @@ SHAPE_GRIDS = {
     "second_mode": {"f2": (150.0, 250.0, 400.0, 650.0, 900.0, 1300.0, 2000.0, 3000.0), "xi2": (0.02, 0.1)},
     "structural_damping": {"dispersion": (0.0, 1.0)},
     "creep": {"shortest": (1e-4, 1e-2)},
-    "coulomb_friction": {"v_s": (1e-5, 3e-4, 3e-3)},
+    "coulomb_friction": {"v_s": (1e-5, 1e-3), "presliding": (1e-8, 1e-7, 1e-6)},
     "sensor_lag": {"order2": (0.0, 0.5)},
     "sensor_nonlinearity": {"q3": (0.0,)},
 }

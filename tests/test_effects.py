@@ -9,7 +9,7 @@ import pytest
 import magjax.effects as effects
 from magjax.chain import BLOCKS, Timeline
 from magjax.effects import CATALOGUE, AbstractEffect
-from magjax.simulate import run_chain
+from magjax.simulate import run_chain, simulate
 from tests.test_simulate import actuator, sine
 
 N = 160
@@ -72,9 +72,31 @@ def test_a_limited_voltage_bounds_the_current():
     assert 0.1 < free.mean() < 0.9 and np.array_equal(current[free], command[free])
 
 
+@pytest.mark.parametrize("presliding", [3e-7, 2e-6])
+def test_friction_with_presliding_against_its_equation_in_time(presliding):
+    from scipy.integrate import solve_ivp
+
+    act = actuator(20)
+    effect = effects.CoulombFriction(f=4e-7, v_s=1e-7, presliding=presliding)
+    signals = simulate(act.with_effect(effect), CURRENT, DT, periodic=True)
+    free = np.asarray(signals.free_displacement)
+    w, xi = 2 * np.pi * float(act.mechanics.f0), float(act.mechanics.xi)
+    times = DT * np.arange(4 * N + 1)
+    pull = lambda t: np.interp(t, times, np.append(np.tile(free, 4), free[0]))
+
+    def rate(t, state):
+        y, v, p = state
+        return [v, w * w * (pull(t) - y - 4e-7 * p) - 2 * xi * w * v, (v - abs(v) * p) / presliding]
+
+    exact = solve_ivp(rate, (0, times[-1]), [free[0], 0, 0], "LSODA", times, rtol=1e-7, atol=1e-12, max_step=DT).y[0, 3 * N : 4 * N]
+    without = np.asarray(simulate(act, CURRENT, DT, periodic=True).displacement)
+    error = np.asarray(signals.displacement) - exact
+    assert np.sqrt(np.mean(error**2)) < 0.03 * np.sqrt(np.mean((without - exact) ** 2))
+
+
 def test_smooth_friction_approaches_coulomb():
     from magjax.effects import CoulombFriction
 
     act = actuator(20)
-    with_friction = [np.asarray(reading(act.with_effect(CoulombFriction(f=2e-7, v_s=v)))) for v in (1e-3, 1e-4, 1e-5)]
+    with_friction = [np.asarray(reading(act.with_effect(CoulombFriction(f=2e-7, v_s=v, presliding=1e-9)))) for v in (1e-3, 1e-4, 1e-5)]
     assert np.abs(with_friction[2] - with_friction[1]).mean() < 0.3 * np.abs(with_friction[1] - with_friction[0]).mean()

@@ -1,12 +1,15 @@
-"""Helper for effects of the mechanics that add a force: their first-order response through G(s), iterated."""
+"""Helper for effects of the mechanics that add a force: the displacement that bears it, by a damped fixed point."""
 
 
-def with_force(displacement, force, line, actuator, rounds: int = 6):
+def with_force(displacement, force, line, actuator, rounds: int = 6, stiffness=0.0):
     """The displacement that solves y = y_linear + G[force(y)], `force` in metres of equivalent free displacement.
 
-    A fixed-point iteration over the whole signal; it converges for forces that are a modest part of the stiffness.
+    A fixed-point iteration over the whole signal. It converges for forces that are a modest part of the stiffness; for one
+    that hardens by s in places, `stiffness` = s/2 (relative to the rod's) keeps it so: each correction is that of a rod with
+    this much more stiffness.
     """
     y = displacement
     for _ in range(rounds):
-        y = displacement + line.filter(force(y), actuator.mechanics.response)
+        left = y - displacement - line.filter(force(y), actuator.mechanics.response)
+        y = y - left - line.filter(left, lambda s: 1 / (1 + stiffness * actuator.mechanics.response(s)) - 1)
     return y
