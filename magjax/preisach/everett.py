@@ -12,6 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+def take(values, index):
+    """values[index] for an index within: unsigned, so that no code is made for negative ones (a tenth of a batch's time)."""
+    return values[index.astype(jnp.uint32)]
+
+
 class EverettTable(eqx.Module):
     """T at the levels with the diagonal masses: everything a step reads.
 
@@ -51,10 +56,10 @@ class EverettTable(eqx.Module):
         width = self.cells + 1
         flat = self.values.ravel()
         corner = i * width + j
-        bilinear = (1 - p) * ((1 - q) * flat[corner] + q * flat[corner + 1]) + p * (
-            (1 - q) * flat[corner + width] + q * flat[corner + width + 1]
+        bilinear = (1 - p) * ((1 - q) * take(flat, corner) + q * take(flat, corner + 1)) + p * (
+            (1 - q) * take(flat, corner + width) + q * take(flat, corner + width + 1)
         )
-        return bilinear - p * (1 - p) * self.diagonal[i] - q * (1 - q) * self.diagonal[j]
+        return bilinear - p * (1 - p) * take(self.diagonal, i) - q * (1 - q) * take(self.diagonal, j)
 
 
 def everett_table(masses: Float[Array, "L L"], low, high, offset) -> EverettTable:
