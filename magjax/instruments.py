@@ -75,6 +75,16 @@ def _fit(name, w, gain, error, law, names, starts) -> LawFit:
     return LawFit(name, {n: (float(v), float(e)) for n, (v, e) in pairs}, float(result.x[0]), chi2, numbers)
 
 
+def judge_source(w, gain, error) -> tuple[str, LawFit, float]:
+    """As `judge_laws` for an amplifier; a filter of second order where neither lag nor delay will do."""
+    verdict, best, rival = judge_laws(fit_laws(w, gain, error, SOURCE_LAWS))
+    if verdict in ("unknown", "delay") and len(w) > 2:
+        wider = _fit("amplifier_lag", w, gain, error, *SENSOR_LAWS["sensor_lag"])
+        if wider.chi2 < best.chi2 - RIVAL and wider.chi2 < 25 * wider.numbers + 50 and wider.z > Z_FOUND:
+            return "amplifier_lag", wider, best.chi2
+    return verdict, best, rival
+
+
 def judge_laws(fits: dict[str, LawFit]) -> tuple[str, LawFit, float]:
     """(verdict, the best law, chi2 of its rival): verdict "follows", a law's name, "group" (laws not told apart) or "unknown"."""
     ranked = sorted(fits.values(), key=lambda f: f.chi2)

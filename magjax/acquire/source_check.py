@@ -6,7 +6,7 @@ rival. Both are fitted to the fundamentals of all recordings; what is left is to
 
 import numpy as np
 
-from ..instruments import SOURCE_LAWS, fit_laws, judge_laws
+from ..instruments import judge_source
 from .log import read_log
 
 
@@ -43,7 +43,7 @@ def check_source(files) -> dict | None:
     if len(found) < 2:
         return None
     w, gain, error = (np.array([f[k] for f in found]) for k in (1, 2, 3))
-    verdict, best, rival = judge_laws(fit_laws(w, gain, error, SOURCE_LAWS))
+    verdict, best, rival = judge_source(w, gain, error)
     turned = np.abs(np.angle(gain / best.gain)) / error
     order = np.argsort(-turned)
     decided = [{"file": found[k][0], "frequency_Hz": float(w[k] / 2 / np.pi), "phase_deg": float(np.degrees(np.angle(gain[k]))), "z": float(turned[k])}

@@ -1,0 +1,151 @@
+"""Instruments that were recorded by themselves: the amplifier by command and shunt, the sensor by a calibration.
+
+A linear filter behind the strain acts the same in the sensor as in the rod, and a lag before the coil much like a loss in
+it: from command and reading alone they are told apart by their form at best, and a filter of second order from the rod's
+resonance not at all. What is measured here leaves the search: the measured current drives the coil, the sensor's filter
+is part of the base, held by its calibration's errors.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from magjax.effects import SensorLag, TransportDelay
+from magjax.errors import RecordingError
+from magjax.instruments import SENSOR_LAWS, fit_laws, judge_laws, judge_source
+
+from .spectra import line_deviations, reduce_recording, with_noise
+
+STRONG = 1e-3  # of the strongest line: weaker ones tell no gain
+FINEST = 1e-5  # relative; no gain is taken for better known
+SETTLES = {"source": ("amplifier_lag", "amplifier_clipping"), "sensor": ("sensor_lag", "transport_delay")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Instrument:
+    """One instrument's own verdict: `block`; `verdict` as of `judge_laws`; `name` of an effect of the catalogue or None;
+    its `parameters`: name -> (value, standard error), SI; `text`."""
+
+    block: str
+    verdict: str
+    name: str | None
+    parameters: dict
+    text: str
+
+    @property
+    def settled(self) -> bool:
+        """Whether effects of its block need not be asked for: the measured current drives the model, a law meets the calibration."""
+        return self.block == "source" or self.verdict == "follows" or self.name is not None
+
+    def effect(self):
+        """The effect with the measured values, None where there is none."""
+        kinds = {"sensor_lag": SensorLag, "transport_delay": TransportDelay}
+        return kinds[self.name](**{k: v for k, (v, _) in self.parameters.items()}) if self.name in kinds else None
+
+
+def has_shunt(recording) -> bool:
+    """Whether a recording holds the command beside a measured current."""
+    command, current = (recording.channels.get(c) for c in ("command", "current"))
+    if command is None or current is None or recording.origin.get("metadata", {}).get("current") == "command":
+        return False
+    return not np.array_equal(command, current)
+
+
+def on_command(recordings) -> list:
+    """The recordings as one without a shunt has them: the command in place of the measured current."""
+    rows = []
+    for r in recordings:
+        channels = {k: v for k, v in r.channels.items() if k != "command"}
+        rows.append(dataclasses.replace(r, channels={**channels, "current": r.channels["command"]}) if has_shunt(r) else r)
+    return rows
+
+
+def line_gains(recordings, drive: str, output: str, columns=None):
+    """(w in rad/s, output over drive, standard error of its parts) at every strong line of the drive, all recordings."""
+    rows = []
+    for s in with_noise([reduce_recording(r, drive, output, columns=columns) for r in recordings]):
+        size = np.abs(s.drive[: len(s.reading)])
+        deviation = np.hypot(line_deviations(s, s.noise), s.drive_noise / np.sqrt(2 * s.samples) * np.abs(s.reading[1]) / size[1:].max())
+        for h in np.flatnonzero(size > STRONG * size[1:].max()):
+            if h > 0:
+                gain = s.reading[h] / s.drive[h]
+                rows.append((2 * np.pi * h * s.frequency, gain, max(deviation[h] / size[h], FINEST * abs(gain))))
+    return tuple(np.array(c) for c in zip(*rows, strict=True))
+
+
+def measured_source(recordings, bench) -> Instrument | None:
+    """The amplifier by command and measured current; None where no recording holds both.
+
+    Raises `RecordingError` where some recordings do and others do not.
+    """
+    having = [has_shunt(r) for r in recordings]
+    if not any(having):
+        return None
+    if not all(having):
+        bare, full = recordings[having.index(False)], recordings[having.index(True)]
+        raise RecordingError(
+            f"{bare.name}: holds no measured current beside the command, {full.name} does; give recordings with the shunt only, "
+            "or leave the column command_A out of all"
+        )
+    gains = line_gains(recordings, "command", "current", bench.columns)
+    verdict, best, _ = judge_source(*gains)
+    tau, error = best.parameters["tau"]
+    size = f"{1e6 * tau:.4g} ± {1e6 * error:.2g} us"
+    if verdict == "follows":
+        return Instrument("source", verdict, None, {}, "The measured current follows its command.")
+    if verdict == "amplifier_lag" and tau > 0:
+        order = "second" if "order2" in best.parameters else "first"
+        text = f"The measured current lags its command by {size} as an amplifier of {order} order does: amplifier_lag (source)."
+        return Instrument("source", verdict, "amplifier_lag", best.parameters, text)
+    what = f"a lag of {size}, a delay or a first-order one" if verdict in ("delay", "group") else "something else than a first-order lag"
+    text = f"Between command and measured current stands {what}; the measured current drives the model."
+    return Instrument("source", verdict, None, {}, text)
+
+
+def measured_sensor(calibrations, bench) -> Instrument | None:
+    """The sensor by its reading over a known displacement; None without calibrations.
+
+    Raises `RecordingError` where a calibration does not repeat or holds too few frequencies.
+    """
+    calibrations = list(calibrations)
+    for r in calibrations:
+        if r.frequency() is None:
+            raise RecordingError(f"{r.name}: the reference does not repeat; calibrate with periodic motion, whole periods of it")
+    if not calibrations:
+        return None
+    w, gain, error = line_gains(calibrations, "reference", bench.output, bench.columns)
+    if len(np.unique(np.round(w, 6))) < 3:
+        raise RecordingError(
+            f"{calibrations[0].name}: the calibration holds {len(w)} frequencies; a filter needs three or more, up to the fastest drive"
+        )
+    verdict, best, _ = judge_laws(fit_laws(w, gain, error, SENSOR_LAWS))
+    reach = f"up to {w.max() / 2 / np.pi:.4g} Hz"
+    scale = "" if abs(best.gain - 1) < 0.002 else f" Its scale is {best.gain:.5g} of what the bench file says; mend it in [columns.{bench.output}]."
+    if verdict == "follows":
+        return Instrument("sensor", verdict, None, {}, f"By its calibration the sensor follows {reach}.{scale}")
+    if verdict == "unknown":
+        text = f"The calibration {reach} is met by no filter of first or second order and no delay; the sensor stays unknown.{scale}"
+        return Instrument("sensor", verdict, None, {}, text)
+    words = ", ".join(f"{k} = {v:.5g} ± {e:.2g}{' s' if k == 'tau' else ''}" for k, (v, e) in best.parameters.items())
+    text = f"By its calibration the sensor has {filter_words(**{k: v for k, (v, _) in best.parameters.items()})} ({words}): {best.law} (sensor).{scale}"
+    return Instrument("sensor", verdict, best.law, best.parameters, text)
+
+
+def filter_words(tau: float, order2: float | None = None) -> str:
+    """A sensor's filter in words: "a second-order filter of 400 Hz, damping 0.71"; without `order2` a delay."""
+    if order2 is None:
+        return f"a delay of {1e6 * tau:.4g} us"
+    if order2 < 0.02:
+        return f"a first-order filter of {1 / (2 * np.pi * tau):.4g} Hz"
+    f, xi = filter_as_mode(tau, order2)
+    return f"a second-order filter of {f:.4g} Hz, damping {xi:.2g}"
+
+
+def filter_as_mode(tau: float, order2: float) -> tuple[float, float]:
+    """(Hz, damping ratio) of 1/(1 + s tau + order2 (s tau)^2)."""
+    return float(1 / (2 * np.pi * tau * np.sqrt(order2))), float(0.5 / np.sqrt(order2))
+
+
+def mode_as_filter(f0: float, xi: float) -> tuple[float, float]:
+    """(tau in s, order2) of the filter that acts as a mode of f0 (Hz) and damping ratio xi."""
+    return float(xi / (np.pi * f0)), float(0.25 / xi**2)

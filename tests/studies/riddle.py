@@ -1,0 +1,84 @@
+"""`python -m tests.studies.riddle`: constants as strange as the founding paper's, and how the tool sees through them.
+
+The bench, made by the independent generator (play operators, its own march of (4)): R_eddy = 290 ohm, f0 = 2 kHz, xi = 0.1,
+an amplifier of 90 us and a Butterworth filter of 400 Hz in the sensor. First command and reading only; then the same drives
+with a shunt, and the sensor moved by a known amount. Everything told is kept in riddle.json.
+"""
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+import numpy as np  # noqa: E402
+
+from fitting.diagnose import diagnose  # noqa: E402
+from magjax.bench import load_bench  # noqa: E402
+from magjax.recording import Recording  # noqa: E402
+from tests.blind.generator.bench import command_of  # noqa: E402
+from tests.blind.generator.coil import C0, FieldSolver  # noqa: E402
+from tests.blind.generator.density import PlayDensity  # noqa: E402
+from tests.blind.generator.rod import displacement, response  # noqa: E402
+from tests.blind.generator.strain import M_S, free_displacement  # noqa: E402
+
+TRUTH = {"coil.R_eddy": 290.0, "mechanics.f0": 2000.0, "mechanics.xi": 0.1}
+LAG, CORNER = 90e-6, 400.0  # s of the amplifier, Hz of the sensor's filter
+BUTTERWORTH = (np.sqrt(2) / (2 * np.pi * CORNER), 0.5)  # tau, order2
+SINES = ((10, 0.8, 0.1), (20, 0.5, -0.2), (50, 0.8, 0.1), (100, 0.5, -0.2), (200, 0.8, 0.1), (300, 0.5, 0.0))
+CHECKS = ((400, 0.6, 0.05), (65, 0.6, 0.0))
+SHAKER = (20, 60, 150, 300, 500, 800, 1200)  # Hz of the calibration
+NOISE, SHUNT_NOISE, REFERENCE_NOISE = 41e-9, 2e-4, 5e-9  # m, A, m
+STEPS, PERIODS = 1000, 4
+
+
+def butterworth(s):
+    """The sensor's filter."""
+    w = 2 * np.pi * CORNER
+    return w**2 / (s * s + np.sqrt(2) * w * s + w**2)
+
+
+def settled(density: str = "gauss", seed: int = 5) -> dict:
+    """One settled period of every drive: command, current (A), reading (m), each (drives, steps), and the frequencies."""
+    drives = [{"frequency": f, "amplitude": A, "offset": b} for f, A, b in (*SINES, *CHECKS)]
+    frequency = np.array([float(d["frequency"]) for d in drives])
+    command = np.array([command_of(d, STEPS) for d in drives])
+    current = response(command, frequency, lambda s: 1 / (1 + s * LAG))
+    plays = PlayDensity(density, 0.92 * M_S, np.random.default_rng(seed))
+    applied = 1.23e4 + C0 * current
+    M, H = FieldSolver(plays, TRUTH["coil.R_eddy"], {}).solve(applied, 1 / (frequency * STEPS), "demagnetized", settle=6)
+    rod = {"f0": TRUTH["mechanics.f0"], "xi": TRUTH["mechanics.xi"]}
+    y = displacement(free_displacement(M, H, {}), M, frequency, rod, {})
+    return {"frequency": frequency, "command": command, "current": current, "reading": response(y, frequency, butterworth)}
+
+
+def recordings(signals: dict, shunt: bool, seed: int = 1) -> tuple[list, list]:
+    """(for the fit, to check): four periods each; without `shunt` the current is the command."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for k, f in enumerate(signals["frequency"]):
+        command, current, y = (np.tile(signals[c][k], PERIODS) for c in ("command", "current", "reading"))
+        count = 2e-4 / 2**16
+        channels = {"displacement": np.round((y + NOISE * rng.standard_normal(len(y))) / count) * count}
+        if shunt:
+            channels |= {"command": command, "current": current + SHUNT_NOISE * rng.standard_normal(len(y))}
+        else:
+            channels |= {"current": command}
+        name = f"{'shunt' if shunt else 'plain'}_{f:g}Hz"
+        rows.append(Recording(np.arange(len(y)) / (f * STEPS), channels, {}, {}, name))
+    return rows[: len(SINES)], rows[len(SINES) :]
+
+
+def calibrations(seed: int = 2) -> list:
+    """The sensor on a shaker, 20 um at seven frequencies, beside a reference that is known better."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for f in SHAKER:
+        x = np.tile(2e-5 * np.sin(2 * np.pi * np.arange(STEPS) / STEPS), PERIODS)
+        y = response(x[None], np.array([f / PERIODS]), butterworth)[0]
+        channels = {"reference": x + REFERENCE_NOISE * rng.standard_normal(len(x)), "displacement": y + NOISE * rng.standard_normal(len(x))}
+        rows.append(Recording(np.arange(len(x)) / (f * STEPS), channels, {}, {}, f"shaker_{f}Hz"))
+    return rows
