@@ -16,6 +16,7 @@ from .check import check_errors
 from .experiments import next_experiment
 from .fit import REFINE_BETWEEN, REST_SETTLED, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
+from .instruments import diagnose_beyond, known_instruments
 from .locate import where
 from .screen import offset_score, screen
 from .setup import Choices, spectra_of
@@ -70,15 +71,18 @@ class Diagnosis:
         }  # fmt: skip
 
 
-def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = Choices(), progress=None) -> Diagnosis:
+def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choices: Choices = Choices(), progress=None) -> Diagnosis:
     """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
 
-    `progress` is called as progress(text, step, chi2 per datum). Returns a `Diagnosis`; raises `RecordingError` where a
+    Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
+    reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum). Returns a `Diagnosis`; raises `RecordingError` where a
     recording cannot be used at all.
     """
     bench = load_bench(bench)
     say = progress or (lambda *a: None)
-    recordings = list(recordings)
+    recordings, check = list(recordings), list(check)
+    if known := known_instruments(recordings, calibration, bench):
+        return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
     held = tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
     spectra = spectra_of(recordings, bench, choices.harmonics)
     say("between the harmonics", 0, None)
@@ -96,7 +100,7 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
         free = held if zero is None else (*held, "sensor.offset")
         base = fit(recordings, bench, actuator=actuator, extra=free, choices=base_now.choices, progress=progress, refine=False)
     recordings = cleaned
-    candidates = screen(base_now.problem, base_now.refined)
+    candidates = _screen(base_now, choices)
     noise = base_now.problem.noise_rms
     floors = {
         "noise_rms": noise,
@@ -112,6 +116,11 @@ def diagnose(recordings, bench, *, check=(), actuator=None, choices: Choices = C
         return found
     note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
     return dataclasses.replace(found, message=found.message + note)
+
+
+def _screen(result, choices) -> list:
+    """Every effect that may be asked for, best first."""
+    return [c for c in screen(result.problem, result.refined) if c.name not in choices.without]
 
 
 def _sensor_zero(recordings, bench, base, actuator, held, choices, progress):
@@ -183,7 +192,7 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
         best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress)
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
-        candidates = screen(best.result.problem, best.result.refined)
+        candidates = _screen(best.result, choices)
     _backward(recordings, bench, state, chosen, count, progress)
     state.unexplained = max(chi2_of(state.current) - count, 0.0)
     return state

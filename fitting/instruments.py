@@ -7,6 +7,7 @@ is part of the base, held by its calibration's errors.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 
@@ -14,10 +15,15 @@ from magjax.effects import SensorLag, TransportDelay
 from magjax.errors import RecordingError
 from magjax.instruments import SENSOR_LAWS, fit_laws, judge_laws, judge_source
 
+from .check import check_errors
+from .fit import fit
+from .joint import data_residual
+from .setup import build_problem, free_parameters, spectra_of
 from .spectra import line_deviations, reduce_recording, with_noise
 
 STRONG = 1e-3  # of the strongest line: weaker ones tell no gain
 FINEST = 1e-5  # relative; no gain is taken for better known
+START_GRID = {"mechanics.f0": (1.0, 2.0, 4.0, 8.0, 16.0), "mechanics.xi": (1.0, 0.2), "coil.R_eddy": (1.0, 4.0)}  # of the bench's word
 SETTLES = {"source": ("amplifier_lag", "amplifier_clipping"), "sensor": ("sensor_lag", "transport_delay")}
 
 
@@ -149,3 +155,91 @@ def filter_as_mode(tau: float, order2: float) -> tuple[float, float]:
 def mode_as_filter(f0: float, xi: float) -> tuple[float, float]:
     """(tau in s, order2) of the filter that acts as a mode of f0 (Hz) and damping ratio xi."""
     return float(xi / (np.pi * f0)), float(0.25 / xi**2)
+
+
+def known_instruments(recordings, calibrations, bench) -> tuple[Instrument, ...]:
+    """What the recordings say about the instruments by themselves; empty without shunt and calibration."""
+    found = (measured_source(recordings, bench) if bench.drive == "current" else None, measured_sensor(calibrations, bench))
+    return tuple(i for i in found if i is not None)
+
+
+def without_command(recordings) -> list:
+    """The recordings with the measured current as their drive, the command put away."""
+    return [dataclasses.replace(r, channels={k: v for k, v in r.channels.items() if k != "command"}) for r in recordings]
+
+
+def nearest_start(recordings, bench, actuator, choices):
+    """The actuator with the start of R_eddy, f0 and xi from which the recordings are met best.
+
+    A bench file's constants may have been fitted through the very filter that is known now, as the founding paper's may.
+    """
+    spectra = spectra_of(recordings, bench, choices.harmonics)
+    names = free_parameters(bench, actuator)
+    grid = {n: [float(actuator.parameters()[n][0]) * f for f in factors] for n, factors in START_GRID.items() if n in names}
+    rest = dataclasses.replace(choices, rest="demagnetized") if choices.rest == "auto" else choices
+    best = (np.inf, actuator)
+    for values in itertools.product(*grid.values()):
+        trial = actuator.replace(dict(zip(grid, values, strict=True)))
+        problem, z = build_problem(spectra, trial, bench, names, rest)
+        misfit = data_residual(problem, z)
+        chi2 = float(misfit @ misfit)
+        if chi2 < best[0]:
+            best = (chi2, trial)
+    return best[1]
+
+
+def diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress):
+    """`diagnose` with the measured instruments in their place, and what they do to the plain model told beside its verdict."""
+    say = progress or (lambda *a: None)
+    plain_start, start = actuator, bench.actuator() if actuator is None else actuator
+    filters = [(i, i.effect()) for i in known if i.effect() is not None]
+    priors = dict(bench.priors)
+    for instrument, effect in filters:
+        start = start.with_effect(effect)
+        priors |= {f"effects.{effect.name}.{k}": e for k, (_, e) in instrument.parameters.items()}
+    without = tuple(n for i in known if i.settled for n in SETTLES[i.block])
+    inner = dataclasses.replace(choices, without=(*choices.without, *without))
+    stated = dataclasses.replace(bench, priors=priors)
+    if filters:
+        say("where to start beside the sensor's filter", 0, None)
+        start = nearest_start(without_command(recordings), stated, start, inner)
+    found = diagnose(without_command(recordings), stated, check=without_command(check), actuator=start if start.effects else None,
+                     choices=inner, progress=progress)  # fmt: skip
+    texts = " ".join(i.text for i in known)
+    if found.verdict == "data_problem" or not any(i.name for i in known):
+        return dataclasses.replace(found, message=f"{texts} {found.message}")
+    say("the plain model, for comparison", 0, None)
+    final = found.repaired or found.base
+    held = tuple(f"effects.{e.name}.{p}" for e in (plain_start.effects if plain_start is not None else ()) for p in e.parameters())
+    plain = fit(on_command(recordings), bench, actuator=plain_start, extra=held, choices=dataclasses.replace(choices, rest=final.choices.rest),
+                progress=progress, refine=False)  # fmt: skip
+    return _joined(known, found, plain, final, on_command(check), without_command(check), bench, texts)
+
+
+def _joined(known, found, plain, final, check_plain, check, bench, texts):
+    """The inner verdict with the instruments named beside it and the plain model as the base."""
+    units = {"tau": "s", "order2": "1"}
+    shifts = {e.name: [e.value, final.estimate(e.name).value] for e in plain.estimates if e.free and not e.name.startswith("effects.")}
+    rows = [
+        {
+            "name": i.name, "block": i.block, "confidence": 0.99, "shifts": shifts,
+            "parameters": {k: {"value": v, "stderr": e, "unit": units[k]} for k, (v, e) in i.parameters.items()},
+        }
+        for i in known if i.name
+    ]  # fmt: skip
+    checks = []
+    for before, after in zip(check_errors(plain.actuator, plain.actuator, check_plain, bench), check_errors(final.actuator, final.actuator, check, bench), strict=True):
+        checks.append({**after, "rms_before": before["rms_before"]})
+    verdict = "attributed" if found.verdict in ("nothing_missing", "absorbed") else found.verdict
+    constants = ", ".join(
+        f"{e.name} = {e.value:.4g} ± {e.stderr:.2g}{'' if e.unit == '1' else ' ' + e.unit}" for e in map(final.estimate, shifts)
+    )
+    named = " and ".join(r["name"] for r in rows)
+    text = f"{texts} With {named} in place chi2/N falls from {plain.chi2_per_sample:.3g} to {final.chi2_per_sample:.2f}; {constants}."
+    if checks:
+        better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in checks)
+        text += f" On check recordings: {better}."
+    rest = "Beyond that nothing is missing." if found.verdict == "nothing_missing" else f"Beyond that: {found.message}"
+    return dataclasses.replace(
+        found, verdict=verdict, message=f"{text} {rest}", effects=(*rows, *found.effects), base=plain, repaired=final, check=tuple(checks)
+    )

@@ -34,6 +34,7 @@ class Choices:
     periods: int = 3
     harmonics: int = HARMONICS
     max_jacobians: int = 30
+    without: tuple[str, ...] = ()  # effects that a diagnosis does not ask for: their instrument was measured
     rest: str = "auto"  # start memory: "negative", "demagnetized" about the drive's zero, "positive", or tried in turn
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .chain import BLOCKS, Coil, FieldCoil, Magnetostriction, Mechanics, Sensor, Source
+from .effects import SensorLag
 from .effects.base import AbstractEffect
 from .errors import ConfigurationError
 from .param import parameters_of
@@ -120,7 +121,8 @@ def from_bench(bench) -> Actuator:
     start = bench.start if bench.start != "auto" else "negative_saturation"
     masses = tan_baras_density(cells, low, high, 0.5 * M_s)
     hysteresis = Preisach(masses, low, high, 0.5 * M_s, start)
-    return Actuator(coil, hysteresis, magnetostriction, mechanics, sensor=block(Sensor, "sensor"), output=bench.output)
+    known = (SensorLag(constants["sensor.tau"], constants.get("sensor.order2", 0.0)),) if "sensor.tau" in constants else ()
+    return Actuator(coil, hysteresis, magnetostriction, mechanics, sensor=block(Sensor, "sensor"), effects=known, output=bench.output)
 
 
 def _plane(bench, coil):

@@ -15,8 +15,9 @@ BLOCK_KEYS = {
     "coil": ("R_eddy", "c0", "H_bias", "N_m", "A_m", "k_eddy"),
     "magnetostriction": ("lambda_s", "M_s", "l_rod"),
     "mechanics": ("f0", "xi"),
-    "sensor": ("offset",),
+    "sensor": ("offset", "tau", "order2"),
 }
+KNOWN_TO = 1e-3  # relative; how well a filter of the sensor that is stated is taken to be known
 OTHER_KEYS = {
     "hysteresis": ("levels", "start"),
     "limits": ("current_A", "field_A_per_m"),
@@ -114,7 +115,7 @@ def _build(content, path) -> Bench:
                     raise ConfigurationError(f"bench {path}: {block}.{key} = {value!r} must be a number")
                 if value < 0 and key not in ("H_bias", "offset"):
                     raise ConfigurationError(f"bench {path}: {block}.{key} = {value} is negative; give a value of zero or more")
-                if value == 0 and key not in ("H_bias", "offset", "k_eddy", "xi"):
+                if value == 0 and key not in ("H_bias", "offset", "k_eddy", "xi", "order2"):
                     raise ConfigurationError(f"bench {path}: {block}.{key} = 0; give a positive value")
                 constants[f"{block}.{key}"] = float(value)
     drive = "field" if "coil.k_eddy" in constants else "current"
@@ -142,6 +143,11 @@ def _build(content, path) -> Bench:
             if key in column and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= top):
                 raise ConfigurationError(f"bench {path}: columns.{quantity}.{key} = {value!r}; give a number above 0 and up to {top}")
     priors = {str(k): float(v) for k, v in fit.get("priors", {}).items()}
+    if "sensor.order2" in constants and "sensor.tau" not in constants:
+        raise ConfigurationError(f"bench {path}: sensor.order2 without sensor.tau; state the filter's tau in s beside it")
+    if "sensor.tau" in constants:
+        for key, least in (("tau", 1e-9), ("order2", 1e-3)):
+            priors.setdefault(f"effects.sensor_lag.{key}", max(KNOWN_TO * constants.get(f"sensor.{key}", 0.0), least))
     return Bench(
         content.get("name", path.stem), present, constants, drive, output, content.get("columns", {}), free,
         levels, start, content.get("limits", {}), priors, str(path),

@@ -102,9 +102,11 @@ def run_diagnose(arguments) -> int:
     """magjax diagnose."""
     p = _common("diagnose", "Say what physics the model leaves out: where, what, how much better with it, what to record next.",
                 "magjax diagnose rec_*.csv --bench aa-050h --check check_*.csv --out result")  # fmt: skip
+    p.add_argument("--calibration", nargs="+", default=[], help="the sensor moved by a known amount: files with reference_m beside the reading")
     options = p.parse_args(arguments)
     prepare_jax()
     from magjax.errors import RecordingError
+    from magjax.readers import load_calibrations
     from magjax.recording import load_recordings
 
     bench, actuator = _bench_and_start(options)
@@ -119,7 +121,7 @@ def run_diagnose(arguments) -> int:
         recordings = load_recordings(options.recordings, bench)
         checks = load_recordings(options.check, bench) if options.check else []
         with Progress(options.quiet or options.json) as progress:
-            found = diagnose(recordings, bench, check=checks, actuator=actuator,
+            found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
                              choices=Choices(max_jacobians=options.max_jacobians), progress=progress)  # fmt: skip
     except RecordingError as error:
         found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))

@@ -19,6 +19,8 @@ BLOCKS = (
 )
 SETTINGS = {
     "name": "what results call the bench (default: the file's name)",
+    "sensor.tau": "filter of the sensor, if it is known (data sheet, calibration): 1/(1 + s tau + order2 (s tau)^2), s; part of the base, not searched for",
+    "sensor.order2": "of that filter: 0 first order (default), 1/3 Bessel, 1/2 Butterworth",
     "hysteresis.levels": "levels L of the Preisach plane that `simulate` starts from, 2 to 400 (default 25)",
     "hysteresis.start": "magnetic state before a simulation: " + ", ".join(f'"{s}"' for s in bench.STARTS) + ' (default "auto")',
     "limits.current_A": "largest current, A: bounds the Preisach plane, what `record` may drive and what is asked for next",
