@@ -27,7 +27,8 @@ SHAPE_GRIDS = {
     "amplifier_lag": {"order2": (0.25,)},
     "excess_loss": {"rate_knee": (0.3, 10.0, 100.0)},
     "field_diffusion": {"tau": (5e-5, 2e-4, 8e-4, 3e-3)},
-    "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3)},
+    "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3), "air": (0.05, 0.9)},
+    "magnetic_aftereffect": {"of_field": (0.05, 0.9)},
     "rate_dependent_switching": {"rate0": (0.3, 10.0, 100.0)},
     "second_mode": {"f2": (150.0, 250.0, 400.0, 650.0, 900.0, 1300.0, 2000.0, 3000.0), "xi2": (0.02, 0.1)},
     "structural_damping": {"dispersion": (0.0, 1.0)},
@@ -151,17 +152,17 @@ def _march(predictor, actuator, current, dt, disturbance=None):
     table = actuator.hysteresis.table()
     memory = actuator.hysteresis.memory(table, predictor.corners)
     whole = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
-    H, M, v, residual, over = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, disturbance)
+    H, M, v, residual, over = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, disturbance, len(current))
     return H, M, v, whole[1], residual, over
 
 
 @eqx.filter_jit
-def _disturbance(effect, actuator, trajectory):
+def _disturbance(effect, predictor, actuator, trajectory):
     """d disturbance / d amplitude at null, (3 of (recordings, time)) per grid: the trajectory does not change."""
 
     def one(v, M, current, dt):
         def of(a):
-            return disturbance_of(effect.with_amplitude(a), actuator, v, M, current, dt)
+            return disturbance_of(effect.with_amplitude(a), actuator, v, M, current, dt, (len(v) - 1) // predictor.periods)
 
         return jax.jvp(of, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
@@ -214,7 +215,7 @@ def columns(problem, z):
         trajectory = _trajectory(predictor, actuator)
         rows = []
         for c, shapes in marching:
-            rows.append((_disturbance(c(**shapes), actuator, trajectory), tuple(jnp.zeros_like(d) for d in predictor.drives)))
+            rows.append((_disturbance(c(**shapes), predictor, actuator, trajectory), tuple(jnp.zeros_like(d) for d in predictor.drives)))
         still = tuple(tuple(jnp.zeros_like(part[0]) for _ in range(3)) for part in trajectory)
         for c, shapes in sources:
             finite = c.amplitude in shapes

@@ -58,7 +58,7 @@ def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str | N
     memory = actuator.hysteresis.memory(table, corners)
     if periodic:
         whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (applied, current)]
-        parts = magnetize(actuator, *whole, line.dt, memory, scheme)
+        parts = magnetize(actuator, *whole, line.dt, memory, scheme, period=count)
         M_unreached = actuator.hysteresis.unreached(jnp.max(parts[2][-count:]), jnp.min(parts[2][-count:]))
         H, M, v, residual = (x[-count - 1 : -1] for x in parts[:4])
         M = M + M_unreached

@@ -100,3 +100,32 @@ def test_smooth_friction_approaches_coulomb():
     act = actuator(20)
     with_friction = [np.asarray(reading(act.with_effect(CoulombFriction(f=2e-7, v_s=v, presliding=1e-9)))) for v in (1e-3, 1e-4, 1e-5)]
     assert np.abs(with_friction[2] - with_friction[1]).mean() < 0.3 * np.abs(with_friction[1] - with_friction[0]).mean()
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        effects.SecondEddyPath(kappa=0.5, tau=3e-3, air=0.0),
+        effects.SecondEddyPath(kappa=0.05, tau=1e-2, air=1.0),
+        effects.MagneticAftereffect(share=0.1, of_field=0.0),
+        effects.MagneticAftereffect(share=0.1, of_field=1.0),
+        effects.FieldDiffusion(kappa=1.0, tau=3e-2),
+    ],
+    ids=lambda e: e.name,
+)
+def test_slow_states_are_led_to_their_repeat(effect):
+    act = actuator(20).with_effect(effect)
+    few, many = (np.asarray(run_chain(act, CURRENT, DT, periods, 4).reading) for periods in (3, 7))
+    before = np.asarray(run_chain(actuator(20), CURRENT, DT, 3, 4).reading)
+    assert np.abs(few - many).max() < 0.03 * np.abs(many - before).max()
+
+
+def test_a_second_path_round_the_coil_filters_the_drive():
+    kappa, tau = 0.05, 2e-3
+    line = Timeline(jnp.asarray(DT), N, True)
+    act = actuator(20)
+    inside = np.asarray(run_chain(act.with_effect(effects.SecondEddyPath(kappa=kappa, tau=tau, air=1.0)), CURRENT, DT, 4, 4, "bdf2").reading)
+    filtered = CURRENT - line.filter(CURRENT, lambda s: kappa * tau * s / (1 + tau * s))
+    outside = np.asarray(run_chain(act, filtered, DT, 4, 4, "bdf2").reading)
+    without = np.asarray(run_chain(act, CURRENT, DT, 4, 4, "bdf2").reading)
+    assert np.abs(inside - outside).max() < 0.03 * np.abs(outside - without).max()

@@ -21,6 +21,7 @@ from jax.lax import stop_gradient
 from ..constants import MU0
 from ..effects.base import Trial
 from ..errors import ConfigurationError
+from ..preisach.everett import take
 from ..preisach.memory import Memory, apply_field, branch_magnetization
 
 SCHEMES = ("bdf2", "trapezoid")
@@ -36,6 +37,7 @@ class _Carry(eqx.Module):
     applied0: jax.Array
     states: tuple
     residual: jax.Array
+    marks: tuple  # states of effects at the last end of a period
 
 
 def solve_branch(table, memory: Memory, p, q, rhs):
@@ -65,9 +67,9 @@ def _level_values(table, cell, fixed, share, rising):
     flat = table.values.ravel()
     here = jnp.where(rising, cell * width + fixed, fixed * width + cell)
     along, across = jnp.where(rising, width, 1), jnp.where(rising, 1, width)
-    bend = share * (1 - share) * table.diagonal[fixed]
-    first = (1 - share) * flat[here] + share * flat[here + across] - bend
-    second = (1 - share) * flat[here + along] + share * flat[here + along + across] - bend
+    bend = share * (1 - share) * take(table.diagonal, fixed)
+    first = (1 - share) * take(flat, here) + share * take(flat, here + across) - bend
+    second = (1 - share) * take(flat, here + along) + share * take(flat, here + along + across) - bend
     return first, second
 
 
@@ -76,7 +78,7 @@ def _slope(table, field, threshold, rising):
     inside = (field > table.low) & (field < table.low + table.cells * table.step)
     cell, local = table.locate(field)
     first, second = _level_values(table, cell, *table.locate(threshold), rising)
-    slope = (second - first) + (2 * local - 1) * table.diagonal[cell]
+    slope = (second - first) + (2 * local - 1) * take(table.diagonal, cell)
     return jnp.where(inside, jnp.where(rising, 2.0, -2.0) * slope / table.step, 0.0)
 
 
@@ -89,11 +91,11 @@ def _locate(table, branch, p, q, rhs):
     flat = table.values.ravel()
     base = jnp.where(rising, fixed, fixed * width)
     along, across = jnp.where(rising, width, 1), jnp.where(rising, 1, width)
-    constant = p * table.low + q * (m_there - 2 * sign * share * (1 - share) * table.diagonal[fixed]) - rhs
+    constant = p * table.low + q * (m_there - 2 * sign * share * (1 - share) * take(table.diagonal, fixed)) - rhs
 
     def not_above(level):
         at = base + jnp.clip(level, 0, L) * along
-        T = (1 - share) * flat[at] + share * flat[at + across]
+        T = (1 - share) * take(flat, at) + share * take(flat, at + across)
         value = constant + p * level * table.step + 2 * q * sign * T
         # rising the branch runs over the levels above the threshold, falling over those below it
         return jnp.where(rising, (level <= fixed) | ((value <= 0) & (level <= L)), (value <= 0) & (level <= fixed))
@@ -108,7 +110,7 @@ def _locate(table, branch, p, q, rhs):
 
     # in the cell T = first + (second - first - D) z + D z^2; go from the anchor by the distance rho that is left
     first, second = _level_values(table, cell, fixed, share, rising)
-    D = table.diagonal[cell]
+    D = take(table.diagonal, cell)
     anchor = jnp.where(cell == fixed, share, jnp.where(rising, 0.0, 1.0))
     T_anchor = first + (second - first - D) * anchor + D * anchor**2
     slope = sign * (second - first - D + 2 * D * anchor)
@@ -135,12 +137,13 @@ def _extra_terms(effects, states, actuator, trial, p, q):
     return p * shift + q * added + loss, shift, added
 
 
-def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid", disturbance=None):
+def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid", disturbance=None, period: int = 0):
     """March (4) from equilibrium: (field H, magnetization M, relay field, residual, overflow) over time.
 
     `applied`: c0 I + H_bias, A/m, (time,); `current` the drive, for effects; `h`: step, s; `memory`: the start state.
     The field H is that of (4); the relays see H less the shifts of hysteresis effects. `residual`: A/m, (time,).
     `disturbance`: what is added at every step as an effect would, (field shift, magnetization, loss), A/m, (time,) each.
+    `period`: steps of a period where the drive repeats, else 0: at its ends slow states are led to where they repeat.
     """
     if scheme not in SCHEMES:
         raise ConfigurationError(f'scheme = "{scheme}" is unknown; write one of {", ".join(SCHEMES)}')
@@ -157,10 +160,11 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
     _, shift, added = _extra_terms(effects, states, actuator, rest, p, q)
     first = memory.field + shift
     X = first + memory.magnetization + added
-    carry = _Carry(memory, X, X, first, applied[0], states, zero)
+    carry = _Carry(memory, X, X, first, applied[0], states, zero, states)
+    ends = _ends_of_periods(len(applied), period)
 
     def advance(c: _Carry, drive):
-        applied1, current1, *given = drive
+        applied1, current1, end, *given = drive
         old = a * (2 * c.X0 - 0.5 * c.X_before) if bdf else a * c.X0 - 0.5 * c.H0 + 0.5 * c.applied0
         rhs = old + (applied1 if bdf else 0.5 * applied1)
         if given:
@@ -186,9 +190,10 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
         if effects:  # the relays' own M at that field, so that a step that did not settle shows
             own, _, threshold, m_there = c.memory.branch(table, v)
             residual = residual + (branch_magnetization(table, own, threshold, m_there, v) - m)
-        return _Carry(memory, H + M, c.X0, H, applied1, states, residual), (H, M, v, residual)
+        states, marks = _settle(effects, states, c.marks, end, period * h)
+        return _Carry(memory, H + M, c.X0, H, applied1, states, residual, marks), (H, M, v, residual)
 
-    carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:], *(d[1:] for d in disturbance or ())))
+    carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:], ends, *(d[1:] for d in disturbance or ())))
 
     def with_first(value, rest):
         return jnp.concatenate([jnp.reshape(value, (1,)), rest])
@@ -198,10 +203,29 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
     return H, M, with_first(rest.field, v), with_first(zero, residual), carry.memory.overflow
 
 
-def disturbance_of(effect, actuator, field, magnetization, current, h):
+def _ends_of_periods(count, period):
+    """Whether a period ends with each step of a march of `count` samples."""
+    at = jnp.arange(1, count)
+    return at % period == 0 if period else jnp.zeros(count - 1, bool)
+
+
+def _settle(effects, states, marks, end, duration):
+    """States and marks (the states at the last end of a period): where a period ends, slow states are led to their repeat."""
+    settled, kept = [], []
+    for effect, state, mark in zip(effects, states, marks, strict=True):
+        if not effect.slow:
+            settled.append(state), kept.append(state)
+            continue
+        there = effect.settled(state, mark, duration)
+        settled.append(tuple(jnp.where(end, a, b) for a, b in zip(there, state, strict=True)))
+        kept.append(tuple(jnp.where(end, a, b) for a, b in zip(there, mark, strict=True)))
+    return tuple(settled), tuple(kept)
+
+
+def disturbance_of(effect, actuator, field, magnetization, current, h, period: int = 0):
     """What an effect would add at every step of a trajectory that it does not change: see `magnetize`.
 
-    `field`, `magnetization`: A/m, `current`: A, all (time,), of a march with the actuator's own coil.
+    `field`, `magnetization`: A/m, `current`: A, all (time,), of a march with the actuator's own coil; `period` as there.
     """
     scale = MU0 / h
     bdf = actuator.coil.scheme == "bdf2"
@@ -210,16 +234,18 @@ def disturbance_of(effect, actuator, field, magnetization, current, h):
     state = effect.start(Trial(field[0], magnetization[0], zero, zero, current[0], h), actuator)
 
     def advance(carry, now):
-        state, X0, X_before, before = carry
-        v, m, drive, X1 = now
+        state, mark, X0, X_before, before = carry
+        v, m, drive, X1, end = now
         change = (1.5 * X1 - 2 * X0 + 0.5 * X_before) if bdf else X1 - X0
         trial = Trial(v, m, scale * change, (v - before) / h, drive, h)
         shift, added = effect.field_shift(trial, state, actuator), effect.magnetization(trial, state, actuator)
         loss = effect.block == "coil"
         row = (zero if loss else shift, added, shift if loss else zero)
-        return (effect.advance(trial, state, actuator), X1, X0, v), row
+        (state,), (mark,) = _settle((effect,), (effect.advance(trial, state, actuator),), (mark,), end, period * h)
+        return (state, mark, X1, X0, v), row
 
-    rows = jax.lax.scan(advance, (state, X[0], X[0], field[0]), (field[1:], magnetization[1:], current[1:], X[1:]))[1]
+    ends = _ends_of_periods(len(field), period)
+    rows = jax.lax.scan(advance, (state, state, X[0], X[0], field[0]), (field[1:], magnetization[1:], current[1:], X[1:], ends))[1]
     return tuple(jnp.concatenate([zero[None], r]) for r in rows)
 
 

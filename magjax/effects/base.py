@@ -39,7 +39,8 @@ class AbstractEffect(eqx.Module):
     """Base of every effect. Class attributes:
 
     `name`, `block` (one of chain.BLOCKS), `law` (the equation), `source` (literature), `signature` (how it shows in
-    data), `in_step` (solved inside the step of (4)), `record_level` (acts on the whole record, not period by period),
+    data), `in_step` (solved inside the step of (4)), `slow` (its state takes longer than
+    a few periods: `settled` leads it to where it repeats), `record_level` (acts on the whole record, not period by period),
     `amplitude` (the parameter whose null removes the effect).
     """
 
@@ -50,6 +51,7 @@ class AbstractEffect(eqx.Module):
     signature: ClassVar[str] = ""
     amplitude: ClassVar[str] = ""
     in_step: ClassVar[bool] = False
+    slow: ClassVar[bool] = False
     record_level: ClassVar[bool] = False
 
     def with_amplitude(self, value):
@@ -87,6 +89,10 @@ class AbstractEffect(eqx.Module):
 
     def advance(self, trial: Trial, state, actuator):
         """Internal state after the step."""
+        return state
+
+    def settled(self, state, before, period):
+        """For slow effects: the state that repeats, from those at the end and at the beginning (`before`) of a `period`, s."""
         return state
 
     def strain(self, free_displacement, magnetization, field, line, actuator):

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from ..param import param
 from .base import AbstractEffect
-from .lags import lagged
+from .lags import lagged, repeated
 
 SHARES = (0.692, 0.131, 0.053, 0.124)  # 4/j0n^2 of the roots of J0, the rest lumped
 RATES = (1.0, 5.27, 12.95, 30.0)  # (j0n/j01)^2
@@ -24,14 +24,15 @@ class FieldDiffusion(AbstractEffect):
     signature = "the eddy lag grows more slowly than frequency; loops at high frequency are narrower than R_eddy from low frequency says"
     amplitude = "kappa"
     in_step = True
+    slow = True
 
     def start(self, trial, actuator):
-        """No flux moves: all lags at zero, and the last rate."""
-        return (jnp.zeros_like(trial.field),) * (len(SHARES) + 1)
+        """No flux moves: all lags at zero, the last rate, the flux moved."""
+        return (jnp.zeros_like(trial.field),) * (len(SHARES) + 2)
 
     def _lags(self, trial, state):
-        before = state[-1]
-        return [lagged(x, before, trial.flux_rate, trial.h, self.tau / r) for x, r in zip(state[:-1], RATES, strict=True)]
+        before = state[-2]
+        return [lagged(x, before, trial.flux_rate, trial.h, self.tau / r) for x, r in zip(state[:-2], RATES, strict=True)]
 
     def field_shift(self, trial, state, actuator):
         """What the lags lack of dB/dt, times k and kappa, A/m."""
@@ -40,4 +41,10 @@ class FieldDiffusion(AbstractEffect):
 
     def advance(self, trial, state, actuator):
         """The lags after the step."""
-        return (*self._lags(trial, state), trial.flux_rate)
+        return (*self._lags(trial, state), trial.flux_rate, state[-1] + trial.h * trial.flux_rate)
+
+    def settled(self, state, before, period):
+        """The lags where they repeat, the flux that the first periods leave behind taken off."""
+        left = (state[-1] - before[-1]) / period
+        lags = (repeated(x, y, period, self.tau / r) - left for x, y, r in zip(state[:-2], before[:-2], RATES, strict=True))
+        return (*lags, *state[-2:])
