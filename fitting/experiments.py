@@ -1,61 +1,146 @@
-"""The next experiment: the recording that best tells rivals apart, within the bench's limits."""
+"""The next experiment: what best tells rivals apart, within the bench's limits.
 
+A drive separates two rivals by what is left of the difference of their predictions once either may still move as far as
+its own fit leaves it free: d' (1 + J_a C_a J_a' + J_b C_b J_b')^-1 d in units of the noise, J the Jacobian of the new
+reading's harmonics, C the covariance of the fit. A difference that a rival's density could take up separates nothing.
+Rivals of which some stand in an instrument and some in the rod are settled by recording the instrument itself.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtr
 
 from magjax.errors import MagjaxError
-from magjax.simulate import simulate
 
+from .model import Predictor, whitened
+from .solver import jacobian
+from .spectra import line_deviations
+from .uncertainty import covariance
+
+SURE = 0.9
+PERIODS = 4
+SHUNT = "the coil current by a shunt, beside its command and on the same clock"
+CALIBRATION = "a calibration of the sensor (its reading of a known displacement; or the same drives again with a known mass added)"
+INSTRUMENTS = ("source", "sensor")
 CHANNELS = {
-    frozenset(("source", "sensor")): "the coil current by a shunt, on the same clock as the displacement",
-    frozenset(("source", "mechanics")): "the coil current by a shunt, on the same clock as the displacement",
-    frozenset(("mechanics", "sensor")): "a calibration of the sensor (or the resonance again with a known mass added)",
     frozenset(("coil", "hysteresis")): "the flux density by a pick-up coil round the rod",
     frozenset(("magnetostriction", "sensor")): "a calibration of the sensor over its range",
 }
 
 
+def channels_for(blocks) -> list[str]:
+    """What to record, in words, for rivals (or a model) in these blocks: shunt and calibration where an instrument is among them."""
+    blocks = set(blocks)
+    if frozenset(blocks) in CHANNELS:
+        return [CHANNELS[frozenset(blocks)]]
+    wanted = []
+    if len(blocks) > 1:
+        wanted += [SHUNT] if "source" in blocks else []
+        wanted += [CALIBRATION] if "sensor" in blocks else []
+    elif blocks == {"sensor"}:
+        wanted = [CALIBRATION]
+    return wanted
+
+
+def instrument_request(blocks, reason: str = "") -> dict:
+    """The request of an instrument's own recording: a `next_experiment` without a drive."""
+    wanted = channels_for({*blocks, "mechanics"})
+    return {"text": f"record {' and '.join(wanted)}{reason}", "drive": None, "channels": wanted, "separates": []}
+
+
 def next_experiment(trials, spectra, bench, noise_rms: float) -> dict | None:
-    """A sine of the menu that separates the best pair of rivals, and the channel that would settle it outright."""
+    """A sine of the menu that separates the rivals best, and the channel that would settle it outright."""
     if len(trials) < 2:
         return None
-    limit = float(bench.limits.get("current_A", bench.limits.get("field_A_per_m", 1.0)))
-    amplitudes = [abs(2 * s.drive[1]) for s in spectra]
-    frequencies = np.array([s.frequency for s in spectra])
-    menu_f = np.unique(np.round(np.concatenate([[0.5 * frequencies.min()], [2 * frequencies.max(), 1.5 * frequencies.max()], frequencies]), 3))
-    best = None
-    phase = 2 * np.pi * np.arange(250) / 250
-    for f in menu_f:
-        for A in (0.3 * max(amplitudes), min(max(amplitudes), limit)):
-            offset = float(spectra[0].drive[0].real)
-            drive = offset + A * np.sin(phase)
-            try:
-                curves = [np.asarray(simulate(t.result.actuator, drive, 1 / (250 * f), periodic=True).reading) for t in trials[:3]]
-            except MagjaxError:
-                continue
-            samples = 4000
-            apart = [
-                np.sqrt(samples * np.mean((a - b) ** 2)) / noise_rms for i, a in enumerate(curves) for b in curves[i + 1 :]
-            ]  # fmt: skip
-            if best is None or min(apart) > best[0]:
-                best = (min(apart), f, A, offset)
-    if best is None:
-        return None
-    apart, f, A, offset = best
-    probability = float(ndtr(0.5 * apart))
-    unit = "A" if bench.drive == "current" else "A/m"
-    channel = None
-    for i, a in enumerate(trials):
-        for b in trials[i + 1 :]:
-            channel = channel or CHANNELS.get(frozenset((a.candidate.block, b.candidate.block)))
+    trials = trials[:3]
+    wanted = channels_for({t.candidate.block for t in trials})
     names = [t.name for t in trials]
-    text = f"four settled periods of {A:.3g} {unit} at {f:.4g} Hz about {offset:.3g} {unit}"
-    text += f": separates {names[0]} from {names[1]} with probability {min(probability, 0.99):.2f}"
-    if channel:
-        text += f"; better, record {channel}"
-    return {
-        "text": text,
-        "drive": {"kind": "sine", "frequency_Hz": float(f), "amplitude": float(A), "offset": offset, "periods": 4},
-        "channels": [channel] if channel else [bench.output],
-        "separates": [[names[0], n, min(probability, 0.99)] for n in names[1:]],
-    }
+    drives = menu(spectra, bench)
+    apart = separations(trials, drives, spectra)
+    best = None if apart is None else int(np.argmax(apart.min(axis=1)))
+    found = {"text": "", "drive": None, "channels": wanted or [bench.output], "separates": []}
+    parts = [f"record {' and '.join(wanted)}"] if wanted else []
+    if best is not None:
+        f, A, offset = drives[best]
+        unit = "A" if bench.drive == "current" else "A/m"
+        odds = np.minimum(ndtr(0.5 * apart[best]), 0.99)
+        sine = f"four settled periods of {A:.3g} {unit} at {f:.4g} Hz about {offset:.3g} {unit}"
+        if odds.min() >= SURE or not wanted:
+            found["drive"] = {"kind": "sine", "frequency_Hz": float(f), "amplitude": float(A), "offset": float(offset), "periods": PERIODS}
+            found["separates"] = [[a, b, float(p)] for (a, b), p in zip(_pairs(names), odds, strict=True) if a == names[0]]
+            parts.append(f"{sine}: separates {names[0]} from {names[1]} with probability {odds.min():.2f}")
+        else:
+            parts.append(f"no sine within the limits does as well (the best, {sine}, with probability {odds.min():.2f})")
+    found["text"] = "; ".join(parts) if len(parts) < 2 or found["drive"] is None else f"{parts[0]}; or {parts[1]}"
+    return found
+
+
+def _pairs(items):
+    return [(a, b) for i, a in enumerate(items) for b in items[i + 1 :]]
+
+
+def menu(spectra, bench) -> list[tuple[float, float, float]]:
+    """(Hz, amplitude, offset) of sines within what has been visited and within the limits, slower and faster ones included."""
+    phases = np.arange(200) / 200
+    drives = [s.drive_at(phases) for s in spectra]
+    low, high = min(d.min() for d in drives), max(d.max() for d in drives)
+    limit = float(bench.limits.get("current_A", bench.limits.get("field_A_per_m", np.inf)))
+    low, high = max(low, -limit), min(high, limit)
+    seen = np.array([s.frequency for s in spectra])
+    frequencies = {0.5 * seen.min(), np.sqrt(seen.min() * seen.max()), seen.max(), 1.5 * seen.max(), 2 * seen.max()}
+    if bench.columns.get("time", {}).get("quasistatic"):
+        frequencies = {seen[0]}
+    return [(f, share * 0.5 * (high - low), 0.5 * (high + low)) for f in sorted(frequencies) for share in (0.98, 0.5)]
+
+
+def separations(trials, drives, spectra):
+    """Distance of every pair of rivals on every drive, standard deviations: (drives, pairs); None where one cannot be simulated."""
+    try:
+        known = [_predicted(t.result, drives, spectra) for t in trials]
+    except MagjaxError:
+        return None
+    columns = []
+    for (r_a, J_a, C_a), (r_b, J_b, C_b) in _pairs(known):
+        rows = []
+        for k in range(len(drives)):
+            d = r_a[k] - r_b[k]
+            spread = np.eye(len(d)) + J_a[k] @ C_a @ J_a[k].T + J_b[k] @ C_b @ J_b[k].T
+            rows.append(float(np.sqrt(max(d @ np.linalg.solve(spread, d), 0.0))))
+        columns.append(rows)
+    return np.array(columns).T
+
+
+@eqx.filter_jit
+def _lines_and_slopes(layout, z, target, template, predictor):
+    def lines(y):
+        return whitened(predictor(layout.actuator(template, y)), target)
+
+    return lines(z), jacobian(lines, z)
+
+
+def _predicted(result, drives, spectra):
+    """Whitened harmonics of the drives, (drives, numbers), their Jacobian, (drives, numbers, unknowns), and the fit's covariance."""
+    problem, solution = result.problem, result.refined
+    wanted = [_asked(spectra[0], *drive) for drive in drives]
+    coarse = problem.predictors[0]
+    predictor = Predictor.build(wanted, min(d.shape[1] for d in coarse.drives), coarse.harmonics, coarse.periods, max(coarse.corners, 4))
+    deviations = np.stack([line_deviations(s, s.noise)[: coarse.harmonics + 1] for s in wanted])
+    deviations[:, 0] = np.where(np.isinf(np.asarray(problem.target.deviations)[0, 0]), np.inf, deviations[:, 0])
+    m, count = deviations.shape
+    zero = jnp.zeros((m, count), complex)
+    target = eqx.tree_at(
+        lambda t: (t.lines, t.deviations, t.gain_rows, t.gain_shares), problem.target, (zero, jnp.asarray(deviations), zero, jnp.zeros((m, m)))
+    )
+    r, J = (np.asarray(x) for x in _lines_and_slopes(problem.layout, jnp.asarray(solution.z), target, problem.template, predictor))
+    at = [np.concatenate([k * count + np.arange(count), m * count + k * (count - 1) + np.arange(count - 1)]) for k in range(m)]
+    return r[np.array(at)], J[np.array(at)], covariance(solution.normal, solution.z, problem.layout.density_unknowns)
+
+
+def _asked(spectrum, f, A, offset):
+    """A spectrum as a recording of that sine would give it."""
+    lines = np.zeros(len(spectrum.drive), complex)
+    lines[:2] = offset, -0.5j * A
+    return dataclasses.replace(spectrum, frequency=float(f), periods=PERIODS, drive=lines, hum=None, systematic=None)

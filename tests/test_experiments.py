@@ -1,0 +1,67 @@
+"""What is asked for next: instruments for rivals that stand in them, else the sine that rivals cannot both follow."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fitting import experiments
+from fitting.experiments import CALIBRATION, SHUNT, channels_for, instrument_request, menu, next_experiment, separations
+from magjax.bench import load_bench
+
+
+def spectrum(f, A, offset):
+    lines = np.array([offset, -0.5j * A, 0.0])
+    at = lambda phases: offset + A * np.sin(2 * np.pi * phases)
+    return SimpleNamespace(frequency=float(f), drive=lines, drive_at=at)
+
+
+def rival(name, block):
+    return SimpleNamespace(name=name, candidate=SimpleNamespace(block=block), result=name)
+
+
+SPECTRA = [spectrum(10, 0.8, 0.1), spectrum(200, 0.4, -0.2)]
+
+
+def test_instruments_are_asked_for_by_themselves():
+    assert channels_for(("source", "coil")) == [SHUNT]
+    assert channels_for(("sensor", "mechanics")) == [CALIBRATION]
+    assert channels_for(("source", "sensor", "mechanics")) == [SHUNT, CALIBRATION]
+    assert channels_for(("mechanics", "magnetostriction")) == []
+    assert "pick-up" in channels_for(("coil", "hysteresis"))[0] and "range" in channels_for(("sensor", "magnetostriction"))[0]
+    asked = instrument_request(("source", "sensor"))
+    assert asked["drive"] is None and "shunt" in asked["text"] and "calibration" in asked["text"] and "known mass" in asked["text"]
+
+
+def test_the_menu_stays_within_what_was_visited():
+    drives = menu(SPECTRA, load_bench("aa-050h"))
+    assert sorted({f for f, _, _ in drives}) == pytest.approx([5.0, np.sqrt(2000), 200.0, 300.0, 400.0])
+    assert all(offset + A <= 0.9 and offset - A >= -0.7001 for _, A, offset in drives)
+
+
+def known(r, J=None, C=None):
+    r = np.asarray(r, float)
+    return r, np.zeros((*r.shape, 1)) if J is None else J, np.eye(1) if C is None else C
+
+
+def test_what_a_fit_could_take_up_separates_nothing(monkeypatch):
+    made = {"a": known([[0.0, 0.0], [0.0, 0.0]]), "b": known([[30.0, 0.0], [0.0, 5.0]], np.array([[[1.0], [0.0]]] * 2), np.array([[1e6]]))}
+    monkeypatch.setattr(experiments, "_predicted", lambda result, drives, spectra: made[result])
+    rivals = [SimpleNamespace(result="a"), SimpleNamespace(result="b")]
+    apart = separations(rivals, [(10, 1, 0), (20, 1, 0)], SPECTRA)
+    assert apart.shape == (2, 1) and apart[0, 0] < 0.1 and apart[1, 0] == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(("gap", "sine"), [(8.0, True), (0.5, False)])
+def test_a_sine_is_proposed_only_where_it_decides(monkeypatch, gap, sine):
+    drives = menu(SPECTRA, load_bench("aa-050h"))
+    rows = {"sensor_lag": np.zeros((len(drives), 2)), "delta_e": np.zeros((len(drives), 2))}
+    rows["delta_e"][3] = gap
+    monkeypatch.setattr(experiments, "_predicted", lambda result, drives, spectra: known(rows[result]))
+    found = next_experiment([rival("sensor_lag", "sensor"), rival("delta_e", "mechanics")], SPECTRA, load_bench("aa-050h"), 4e-8)
+    assert found["channels"] == [CALIBRATION] and found["text"].startswith("record a calibration")
+    assert (found["drive"] is not None) == sine and bool(found["separates"]) == sine
+    if sine:
+        assert found["drive"]["frequency_Hz"] == pytest.approx(drives[3][0]) and found["separates"][0][:2] == ["sensor_lag", "delta_e"]
+    else:
+        assert "no sine within the limits" in found["text"]
