@@ -13,10 +13,10 @@ from magjax.effects import CATALOGUE
 
 from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, STRUCTURES, TIE, chi2_of, confidence, leaders, rivals_of, try_effect
 from .check import check_errors
-from .experiments import next_experiment
+from .experiments import instrument_request, next_experiment
 from .fit import REFINE_BETWEEN, REST_SETTLED, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
-from .instruments import diagnose_beyond, known_instruments
+from .instruments import diagnose_beyond, exchange, known_instruments
 from .locate import where
 from .screen import offset_score, screen
 from .setup import Choices, spectra_of
@@ -276,19 +276,30 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
             text += f" These recordings could not show {', '.join(common['absorbed'])}: the density absorbs them."
         return Diagnosis("nothing_missing", text, **common)
     better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
+    swap, asked = exchange(state.current, bench), None
+    if swap:
+        measured = all(r.origin.get("metadata", {}).get("current") == "measured" for r in recordings)
+        asked = instrument_request({"sensor"} if measured else {"source", "sensor"})
+        if swap[1] and not any("sensor_lag" in g for g in groups):
+            effects = [e for e in effects if e["name"] != "sensor_lag"]
+            groups.append(["sensor_lag", "second_mode"])
     if groups:
-        experiment = next_experiment(last_rivals, base.spectra, bench, base_now.problem.noise_rms) if last_rivals else None
+        experiment = asked or (next_experiment(last_rivals, base.spectra, bench, base_now.problem.noise_rms) if last_rivals else None)
         names = "; ".join(" or ".join(g) for g in groups)
         text = f"something is missing that these recordings cannot tell apart: {names}."
         if effects:
             text += f" Found beside it: {', '.join(e['name'] for e in effects)}."
+        text += f" {swap[0]}" if swap else ""
+        text += f" chi2/N falls from {base.chi2_per_sample:.3g} to {excess:.2f}." if swap else ""
         if experiment:
             text += f" Next: {experiment['text']}."
         return Diagnosis("group", text, tuple(effects), tuple(groups), next_experiment=experiment, **common)
     named = " and ".join(f"{e['name']} ({e['block']})" for e in effects)
     text = f"{named} {'was' if len(effects) == 1 else 'were'} left out: chi2/N falls from {base.chi2_per_sample:.3g} to {excess:.2f}."
     text += f" On check recordings: {better}." if better else " Record a check at another frequency to confirm it."
-    return Diagnosis("attributed", text, tuple(effects), **common)
+    if swap:
+        text += f" {swap[0]} To tell: {asked['text']}."
+    return Diagnosis("attributed", text, tuple(effects), next_experiment=asked, **common)
 
 
 def _unknown(state, share, excess, common, note: str = "") -> Diagnosis:

@@ -21,6 +21,9 @@ from .joint import data_residual
 from .setup import build_problem, free_parameters, spectra_of
 from .spectra import line_deviations, reduce_recording, with_noise
 
+SECOND_ORDER = 0.05  # order2 from which a sensor's filter is one of second order
+RINGING = 0.5  # damping below which a filter is no instrument's
+NOT_LINEAR = {"duffing_stiffness", "delta_e", "coulomb_friction", "backlash", "sensor_nonlinearity", "stress_feedback"}  # between rod and sensor
 STRONG = 1e-3  # of the strongest line: weaker ones tell no gain
 FINEST = 1e-5  # relative; no gain is taken for better known
 START_GRID = {"mechanics.f0": (1.0, 2.0, 4.0, 8.0, 16.0), "mechanics.xi": (1.0, 0.2), "coil.R_eddy": (1.0, 4.0)}  # of the bench's word
@@ -155,6 +158,32 @@ def filter_as_mode(tau: float, order2: float) -> tuple[float, float]:
 def mode_as_filter(f0: float, xi: float) -> tuple[float, float]:
     """(tau in s, order2) of the filter that acts as a mode of f0 (Hz) and damping ratio xi."""
     return float(xi / (np.pi * f0)), float(0.25 / xi**2)
+
+
+def exchange(result, bench) -> tuple[str, bool] | None:
+    """Whether the sensor's fitted filter and the rod's resonance could change places: (a sentence, whether they likely have).
+
+    Linear filters commute: 1/(1 + s tau + order2 (s tau)^2) in the sensor behind a mode f0, xi reads the same as the mode's
+    filter in the sensor behind a rod that resonates as the sensor's did. None where something tells them apart: a stated
+    prior of f0, xi or the filter, a first-order filter, or mechanics that are not linear. A "sensor" that rings (damping
+    below one half, as no instrument's filter does) is likely the rod.
+    """
+    held = {e.name for e in result.actuator.effects}
+    names = {e.name for e in result.estimates if e.free}
+    mode, filtered = ("mechanics.f0", "mechanics.xi"), ("effects.sensor_lag.tau", "effects.sensor_lag.order2")
+    if not {*mode, *filtered} <= names or {*mode, *filtered} & set(bench.priors) or held & NOT_LINEAR:
+        return None
+    (f0, xi), (tau, order2) = ([result.estimate(n).value for n in pair] for pair in (mode, filtered))
+    if order2 < SECOND_ORDER or tau <= 0:
+        return None
+    f, damping = filter_as_mode(tau, order2)
+    text = (
+        f"The sensor's filter ({f:.4g} Hz, damping {damping:.2g}) and the rod's resonance ({f0:.4g} Hz, damping {xi:.2g}) can change places "
+        "without any change of the reading"
+    )
+    if damping < RINGING:
+        return f"{text}, and no instrument's filter rings like that: the rod may be what rings. By these channels instruments and actuator are not told apart.", True
+    return f"{text}: f0 and xi are the rod's only if this is the right way round.", False
 
 
 def known_instruments(recordings, calibrations, bench) -> tuple[Instrument, ...]:

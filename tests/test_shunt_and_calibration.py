@@ -1,11 +1,13 @@
 """Instruments recorded by themselves: the amplifier by its shunt, the sensor by a calibration, a filter that the bench file states."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fitting.instruments import (
+    exchange,
     filter_as_mode,
     has_shunt,
     known_instruments,
@@ -118,3 +120,22 @@ def test_a_bench_file_states_the_sensors_filter(tmp_path):
     path.write_text(text + "[sensor]\norder2 = 0.5\n")
     with pytest.raises(ConfigurationError, match="order2 without sensor.tau"):
         load_bench(path)
+
+
+def fitted(f0, xi, tau, order2, effects=("sensor_lag",)):
+    values = {"mechanics.f0": f0, "mechanics.xi": xi, "effects.sensor_lag.tau": tau, "effects.sensor_lag.order2": order2}
+    rows = [SimpleNamespace(name=n, value=v, free=True) for n, v in values.items()]
+    actuator = SimpleNamespace(effects=[SimpleNamespace(name=n) for n in effects])
+    return SimpleNamespace(actuator=actuator, estimates=rows, estimate=lambda name: next(r for r in rows if r.name == name))
+
+
+def test_a_filter_that_could_change_places_with_the_rod_is_told():
+    bench = load_bench(BENCH)
+    text, ringing = exchange(fitted(400.0, 0.71, *mode_as_filter(2000.0, 0.1)), bench)
+    assert ringing and "2000 Hz, damping 0.1" in text and "400 Hz, damping 0.71" in text and "not told apart" in text
+    text, ringing = exchange(fitted(2000.0, 0.1, *mode_as_filter(400.0, 0.71)), bench)
+    assert not ringing and "right way round" in text
+    assert exchange(fitted(405.0, 0.8, 1e-4, 0.0), bench) is None  # of first order: nothing to exchange
+    assert exchange(fitted(405.0, 0.8, 1e-4, 0.5, ("sensor_lag", "delta_e")), bench) is None
+    known = dataclasses.replace(bench, priors={"mechanics.f0": 20.0})
+    assert exchange(fitted(405.0, 0.8, 1e-4, 0.5), known) is None
