@@ -234,9 +234,9 @@ def diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices
         start = nearest_start(without_command(recordings), stated, start, inner)
     found = diagnose(without_command(recordings), stated, check=without_command(check), actuator=start if start.effects else None,
                      choices=inner, progress=progress)  # fmt: skip
-    texts = " ".join(i.text for i in known)
+    texts = " ".join(i.text for i in known if (i.block, i.verdict) != ("source", "follows"))
     if found.verdict == "data_problem" or not any(i.name for i in known):
-        return dataclasses.replace(found, message=f"{texts} {found.message}")
+        return dataclasses.replace(found, message=f"{found.message} {texts}".strip())
     say("the plain model, for comparison", 0, None)
     final = found.repaired or found.base
     held = tuple(f"effects.{e.name}.{p}" for e in (plain_start.effects if plain_start is not None else ()) for p in e.parameters())

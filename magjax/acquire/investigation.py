@@ -167,7 +167,10 @@ def judge(content: dict, source: dict | None) -> dict:
     """What a diagnosis and the source's own check say together: verdict, effects with who decided them, settled, message."""
     effects = [{**e, "decided_by": deciders(content)} for e in content["effects"]]
     verdict, message = content["verdict"], content["message"]
-    if source and source["verdict"] == "amplifier_lag":
+    if any(e["name"] == "amplifier_lag" for e in effects):  # the diagnosis has judged the source from the same recordings
+        names = [Path(d["file"]).name for d in (source or {}).get("decided_by", [])[:3]]
+        effects = [{**e, "decided_by": names or e["decided_by"]} if e["name"] == "amplifier_lag" else e for e in effects]
+    elif source and source["verdict"] == "amplifier_lag":
         tau = {"value": source["tau"], "stderr": source["stderr"], "unit": "s"}
         names = [Path(d["file"]).name for d in source["decided_by"][:3]]
         effects.append(
@@ -182,7 +185,7 @@ def judge(content: dict, source: dict | None) -> dict:
         )
         message += f" The measured current lags its command by {1e6 * tau['value']:.3g} us as a first-order amplifier does: amplifier_lag (source)."
         verdict = "attributed" if verdict == "nothing_missing" else verdict
-    elif source and source["verdict"] != "follows":
+    elif source and source["verdict"] != "follows" and "Between command and measured current" not in message:
         message += f" Between command and measured current stands something else than a first-order lag ({source['verdict']})."
     checks = [r for r in content.get("check", []) if r["noise_rms"] > 0]
     foretold = all(r["rms_after"] < 3 * r["noise_rms"] for r in checks)

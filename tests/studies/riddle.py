@@ -5,7 +5,6 @@ an amplifier of 90 us and a Butterworth filter of 400 Hz in the sensor. First co
 with a shunt, and the sensor moved by a known amount. Everything told is kept in riddle.json.
 """
 
-import dataclasses
 import json
 import sys
 import time
@@ -17,7 +16,9 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 from fitting.diagnose import diagnose  # noqa: E402
+from fitting.setup import Choices  # noqa: E402
 from magjax.bench import load_bench  # noqa: E402
+from magjax.cli.runtime import prepare_jax  # noqa: E402
 from magjax.recording import Recording  # noqa: E402
 from tests.blind.generator.bench import command_of  # noqa: E402
 from tests.blind.generator.coil import C0, FieldSolver  # noqa: E402
@@ -82,3 +83,54 @@ def calibrations(seed: int = 2) -> list:
         channels = {"reference": x + REFERENCE_NOISE * rng.standard_normal(len(x)), "displacement": y + NOISE * rng.standard_normal(len(x))}
         rows.append(Recording(np.arange(len(x)) / (f * STEPS), channels, {}, {}, f"shaker_{f}Hz"))
     return rows
+
+
+def constants(result) -> dict:
+    """name -> [value, standard error] of what the riddle is about."""
+    return {n: [result.estimate(n).value, result.estimate(n).stderr] for n in TRUTH}
+
+
+def part(found, seconds: float) -> dict:
+    """What is kept of a diagnosis."""
+    content = found.as_dict()
+    return {
+        "verdict": found.verdict, "message": found.message, "effects": content["effects"], "groups": content["groups"],
+        "next_experiment": content["next_experiment"], "check": content["check"], "chi2n_plain": found.base.chi2_per_sample,
+        "chi2n_repaired": found.repaired.chi2_per_sample if found.repaired else None, "plain": constants(found.base),
+        "repaired": constants(found.repaired) if found.repaired else None, "seconds": round(seconds, 1),
+    }  # fmt: skip
+
+
+def tell(density: str = "gauss", choices: Choices | None = None, progress=None) -> dict:
+    """Both acts: command and reading alone, then with shunt and calibration."""
+    bench, signals = load_bench("aa-050h"), settled(density)
+    choices = choices or Choices(rest="demagnetized")
+    acts = {}
+    for act, shunt, calibration in (("command and reading", False, ()), ("shunt and calibration", True, calibrations())):
+        begin = time.perf_counter()
+        runs, checks = recordings(signals, shunt)
+        found = diagnose(runs, bench, check=checks, calibration=calibration, choices=choices, progress=progress)
+        acts[act] = part(found, time.perf_counter() - begin)
+    pulls = {n: (v - TRUTH[n]) / e for n, (v, e) in acts["shunt and calibration"]["repaired"].items()}
+    for effect in acts["shunt and calibration"]["effects"]:
+        true = {"amplifier_lag": {"tau": LAG}, "sensor_lag": dict(zip(("tau", "order2"), BUTTERWORTH, strict=True))}.get(effect["name"], {})
+        pulls |= {f"{effect['name']}.{k}": (effect["parameters"][k]["value"] - v) / effect["parameters"][k]["stderr"] for k, v in true.items()}
+    return {"density": density, "truth": TRUTH | {"amplifier": LAG, "sensor": CORNER}, **acts, "pulls": pulls}
+
+
+def main():
+    """Tell it and keep it in riddle.json (`--density NAME` for another one, which is only printed)."""
+    prepare_jax()
+    density = sys.argv[sys.argv.index("--density") + 1] if "--density" in sys.argv else "gauss"
+    begin = time.perf_counter()
+    say = lambda text, step, chi2: print(f"{time.perf_counter() - begin:7.1f} s  {text} {step or ''} {'' if chi2 is None else f'{chi2:.4g}'}", flush=True)
+    told = tell(density, progress=lambda text, step, chi2: say(text, step, chi2) if step % 10 == 0 else None)
+    for act in ("command and reading", "shunt and calibration"):
+        print(f"\n{act}: {told[act]['verdict']}. {told[act]['message']}")
+    print("\ndistance from the truth in stated errors:", {k: round(v, 2) for k, v in told["pulls"].items()})
+    if density == "gauss":
+        Path(__file__).with_name("riddle.json").write_text(json.dumps(told, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
