@@ -23,7 +23,7 @@ from .uncertainty import covariance
 SURE = 0.9
 PERIODS = 4
 SHUNT = "the coil current by a shunt, beside its command and on the same clock"
-CALIBRATION = "a calibration of the sensor (its reading of a known displacement; or the same drives again with a known mass added)"
+CALIBRATION = "a calibration of the sensor (its reading of a known displacement; a mass added, which moves the rod's resonance alone, tells too)"
 INSTRUMENTS = ("source", "sensor")
 CHANNELS = {
     frozenset(("coil", "hysteresis")): "the flux density by a pick-up coil round the rod",

@@ -30,7 +30,7 @@ def test_instruments_are_asked_for_by_themselves():
     assert channels_for(("mechanics", "magnetostriction")) == []
     assert "pick-up" in channels_for(("coil", "hysteresis"))[0] and "range" in channels_for(("sensor", "magnetostriction"))[0]
     asked = instrument_request(("source", "sensor"))
-    assert asked["drive"] is None and "shunt" in asked["text"] and "calibration" in asked["text"] and "known mass" in asked["text"]
+    assert asked["drive"] is None and "shunt" in asked["text"] and "calibration" in asked["text"] and "a mass added" in asked["text"]
 
 
 def test_the_menu_stays_within_what_was_visited():
