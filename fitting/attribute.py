@@ -17,7 +17,8 @@ SETTLED_CHI2 = 1.12  # a leader that reaches this leaves only close rivals to tr
 CLOSE = 0.8  # share of the best score that makes a close rival
 MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
 BIC_DROP = 10.0
-TIE = 9.0  # chi2; rivals nearer than this to the best are not told apart
+TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
+WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
 SAME_DIRECTION = 0.97
 
 
@@ -59,20 +60,25 @@ def leaders(candidates, count: int = LEADERS):
     return chosen
 
 
-def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None) -> Trial:
-    """Fit base + effect from scratch, started at the screening's amplitude."""
+def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None, warm: bool = False) -> Trial:
+    """Fit base + effect from scratch, started at the screening's amplitude; `warm`: from the density of the base."""
     info = effect_class.parameters()[effect_class.amplitude]
     reach = max(abs(t) for t in info.typical) if info.typical else 10 * info.scale
     amplitude = float(np.clip(candidate.amplitude, -reach, reach))
     effect = effect_class(**candidate.shapes).with_amplitude(amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale)
     names = tuple(f"effects.{effect.name}.{p}" for p in effect.parameters())
     held = tuple(f"effects.{e.name}.{p}" for e in base.actuator.effects for p in e.parameters())
-    result = fit(recordings, bench, actuator=base.actuator.with_effect(effect), extra=(*held, *names), choices=choices, refine=False, progress=progress)
+    start = base.solution.z[: base.problem.layout.density_unknowns + 1] if warm and choices.knots == base.choices.knots else None
+    actuator = base.actuator.with_effect(effect)
+    result = fit(recordings, bench, actuator=actuator, extra=(*held, *names), choices=choices, refine=False, progress=progress, start=start)
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
     drop = chi2_of(base) - chi2_of(result)
-    value = result.estimate(f"effects.{effect.name}.{effect.amplitude}").value
-    physical = value >= 0 or not candidate.one_sided
+    physical = all(
+        result.estimate(f"effects.{e.name}.{e.amplitude}").value >= 0
+        for e in result.actuator.effects
+        if e.parameters()[e.amplitude].low >= 0 and f"effects.{e.name}.{e.amplitude}" in (*held, *names)
+    )
     extra = len(names) * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
     return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)))
@@ -84,10 +90,11 @@ def rivals_of(best: Trial, trials) -> list[Trial]:
     for t in trials:
         if t is best or not t.physical:
             continue
-        behind = chi2_of(t.result) - chi2_of(best.result)
-        if behind < TIE or (behind < 2 * TIE and _same(t, best)):
+        behind = t.bic_change - best.bic_change
+        weak = min(WEAK_TIE[0] * best.drop, WEAK_TIE[1]) if t.result.chi2_per_sample < SETTLED_CHI2 else 0.0
+        if behind < max(TIE, weak) or (behind < 2 * TIE and _same(t, best)):
             tied.append(t)
-    return sorted(tied, key=lambda t: chi2_of(t.result))
+    return sorted(tied, key=lambda t: t.bic_change)
 
 
 def _same(a: Trial, b: Trial) -> bool:

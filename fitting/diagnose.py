@@ -27,6 +27,7 @@ RECORD_Z = 8.0
 FULL_SHARE = 0.93
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 MAX_EFFECTS = 3
+SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 ABSORBED_VISIBILITY = 0.004
 
 
@@ -109,7 +110,7 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     }
     place = where(base_now, candidates, recordings, bench.output)
     absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY)
-    state = _search(recordings, bench, base_now, candidates, choices, progress)
+    state = _search(recordings, bench, base_now, candidates, choices, progress, check)
     common = {"floors": floors, "where": place, "absorbed": absorbed, "base": base}
     found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common)
     if zero is None:
@@ -161,7 +162,7 @@ class _State:
     unexplained: float
 
 
-def _search(recordings, bench, base, candidates, choices, progress) -> _State:
+def _search(recordings, bench, base, candidates, choices, progress, check=()) -> _State:
     """Forward: fit the leaders from scratch, adopt the best while it earns its place; then screen again."""
     say = progress or (lambda *a: None)
     classes = {c.name: c for c in CATALOGUE}
@@ -171,7 +172,8 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
     chosen = base.choices  # the density chosen for the base may be finer than the default: rivals get the same
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
-        if not top or abs(top[0].z) < Z_THRESHOLD:
+        calm = state.steps and state.current.chi2_per_sample < SILENT_CHI2
+        if not top or abs(top[0].z) < (SECOND_Z if calm else Z_THRESHOLD):
             break
         excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
         trials = []
@@ -180,14 +182,16 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
             if settled and c.name not in STRUCTURES and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
                 continue
             say(f"trying {c.name}", 0, state.current.chi2_per_sample)
-            trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress)
+            trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress, bool(state.steps))
             trials.append(trial)
             state.tried[c.name] = trial.candidate
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
         if not good:
             break
-        best = min(good, key=lambda t: chi2_of(t.result) + (0 if t.result.converged else 5))
+        best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
         if state.steps and best.drop < 0.5 * excess and chi2_of(state.current) / count > 1.3 and best.drop < 0.3 * excess:
+            break
+        if state.steps and check and _predicts_worse(state.current.actuator, best.result.actuator, check, bench):
             break
         best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress)
         state.steps.append((best, rivals_of(best, good), good, state.current))
@@ -196,6 +200,13 @@ def _search(recordings, bench, base, candidates, choices, progress) -> _State:
     _backward(recordings, bench, state, chosen, count, progress)
     state.unexplained = max(chi2_of(state.current) - count, 0.0)
     return state
+
+
+def _predicts_worse(before, after, check, bench) -> bool:
+    """Does a further effect raise the error on check recordings, taken together in units of their noise?"""
+    rows = check_errors(before, after, check, bench)
+    old, new = (sum((r[k] / (r["noise_rms"] or r["rms_before"])) ** 2 for r in rows) for k in ("rms_before", "rms_after"))
+    return new > 1.02 * old
 
 
 def _backward(recordings, bench, state, chosen, count, progress):
@@ -237,7 +248,7 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress):
     near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
     again = [try_effect(recordings, bench, current, t.candidate, classes[t.name], found, excess, progress) for t in near]
     again = [t for t in again if t.physical] or [best]
-    return min(again, key=lambda t: chi2_of(t.result)), again, found
+    return min(again, key=lambda t: t.bic_change), again, found
 
 
 def _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common) -> Diagnosis:

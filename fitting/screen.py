@@ -29,7 +29,7 @@ SHAPE_GRIDS = {
     "field_diffusion": {"tau": (5e-5, 2e-4, 8e-4, 3e-3)},
     "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3), "air": (0.05, 0.9)},
     "magnetic_aftereffect": {"of_field": (0.05, 0.9)},
-    "rate_dependent_switching": {"rate0": (0.3, 10.0, 100.0)},
+    "rate_dependent_switching": {"rate0": (1e3, 3e4, 1e6), "of_flux": (0.05, 0.9)},
     "second_mode": {"f2": (150.0, 250.0, 400.0, 650.0, 900.0, 1300.0, 2000.0, 3000.0), "xi2": (0.02, 0.1)},
     "structural_damping": {"dispersion": (0.0, 1.0)},
     "creep": {"shortest": (1e-4, 1e-2)},

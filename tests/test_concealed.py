@@ -26,7 +26,7 @@ CASES = [
     ("backlash", {"gap": 9e-8}, True),
     ("duffing_stiffness", {"k3": 0.03}, True),
     ("inductive_crosstalk", {"kappa": 3e-10}, False),
-    ("rate_dependent_switching", {"gamma": 9.0, "rate0": 3.0}, True),
+    ("rate_dependent_switching", {"gamma": 9.0, "rate0": 1e5}, True),
     ("structural_damping", {"eta": 0.006, "dispersion": 0.0, "exponent": 1e-3}, False),
     ("stress_feedback", {"stiffness": 2e9}, False),
     ("magnetic_aftereffect", {"share": 0.006}, True),

@@ -3,19 +3,24 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..constants import MU0
 from ..param import param
 from .base import AbstractEffect
 
 
 class RateDependentSwitching(AbstractEffect):
-    """Sharrock's law: the relays lag by gamma asinh(dM-rate): a field gamma asinh(dB/dt / rate0)."""
+    """Sharrock's law: the relays lag by gamma asinh of the sweep rate over rate0, that of the field or, `of_flux`, of B.
+
+    B counts by the mean susceptibility chi of the plane, so that both rates are of one size, A/m/s.
+    """
 
     gamma: Float[Array, ""] = param(0.0, "A/m", "coercive shift per e-fold of the rate", low=0.0, scale=10.0, null=0.0, typical=(1.0, 200.0))
-    rate0: Float[Array, ""] = param(1.0, "T/s", "rate at which the shift sets in", low=0.0, scale=1.0, shape=True, typical=(0.01, 100.0))
+    rate0: Float[Array, ""] = param(1e4, "A/m/s", "rate at which the shift sets in", low=0.0, scale=1e4, shape=True, typical=(1e2, 1e7))
+    of_flux: Float[Array, ""] = param(0.0, "1", "0: the rate of the field, 1: that of the flux density", low=0.0, high=1.0, scale=0.5, shape=True, typical=(0.0, 1.0))
 
     name = "rate_dependent_switching"
     block = "hysteresis"
-    law = "H = v + gamma asinh((dB/dt) / rate0)"
+    law = "H = v + gamma asinh(r / rate0), r = (1 - of_flux) dv/dt + of_flux dB/dt / (mu0 chi)"
     source = "M. P. Sharrock, J. Appl. Phys. 76 (1994) 6413: coercivity rises with the logarithm of the sweep rate"
     signature = "loops widen by equal steps a decade of frequency"
     amplitude = "gamma"
@@ -23,4 +28,7 @@ class RateDependentSwitching(AbstractEffect):
 
     def field_shift(self, trial, state, actuator):
         """H less the relays' field, A/m."""
-        return self.gamma * jnp.arcsinh(trial.flux_rate / (self.rate0 + 1e-9))
+        plane = actuator.hysteresis
+        chi = 2 * jnp.sum(plane.masses) / (plane.high - plane.low)
+        rate = (1 - self.of_flux) * trial.field_rate + self.of_flux * trial.flux_rate / (MU0 * chi)
+        return self.gamma * jnp.arcsinh(rate / (self.rate0 + 1e-3))
