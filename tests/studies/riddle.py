@@ -34,6 +34,7 @@ CHECKS = ((400, 0.6, 0.05), (65, 0.6, 0.0))
 SHAKER = (20, 60, 150, 300, 500, 800, 1200)  # Hz of the calibration
 NOISE, SHUNT_NOISE, REFERENCE_NOISE = 41e-9, 2e-4, 5e-9  # m, A, m
 STEPS, PERIODS = 1000, 4
+KEPT = Path(__file__).with_name("riddle.json")
 
 
 def butterworth(s):
@@ -101,21 +102,40 @@ def part(found, seconds: float) -> dict:
     }  # fmt: skip
 
 
-def tell(density: str = "gauss", choices: Choices | None = None, progress=None) -> dict:
-    """Both acts: command and reading alone, then with shunt and calibration."""
-    bench, signals = load_bench("aa-050h"), settled(density)
-    choices = choices or Choices(rest="demagnetized")
-    acts = {}
-    for act, shunt, calibration in (("command and reading", False, ()), ("shunt and calibration", True, calibrations())):
-        begin = time.perf_counter()
-        runs, checks = recordings(signals, shunt)
-        found = diagnose(runs, bench, check=checks, calibration=calibration, choices=choices, progress=progress)
-        acts[act] = part(found, time.perf_counter() - begin)
-    pulls = {n: (v - TRUTH[n]) / e for n, (v, e) in acts["shunt and calibration"]["repaired"].items()}
-    for effect in acts["shunt and calibration"]["effects"]:
-        true = {"amplifier_lag": {"tau": LAG}, "sensor_lag": dict(zip(("tau", "order2"), BUTTERWORTH, strict=True))}.get(effect["name"], {})
-        pulls |= {f"{effect['name']}.{k}": (effect["parameters"][k]["value"] - v) / effect["parameters"][k]["stderr"] for k, v in true.items()}
-    return {"density": density, "truth": TRUTH | {"amplifier": LAG, "sensor": CORNER}, **acts, "pulls": pulls}
+ACTS = {"command and reading": False, "shunt and calibration": True}  # with the instruments' own recordings?
+
+
+def act(instruments: bool, density: str = "gauss", choices: Choices | None = None, progress=None) -> dict:
+    """One diagnosis: of command and reading alone, or with shunt and calibration."""
+    runs, checks = recordings(settled(density), instruments)
+    begin = time.perf_counter()
+    found = diagnose(
+        runs, load_bench("aa-050h"), check=checks, calibration=calibrations() if instruments else (),
+        choices=choices or Choices(rest="demagnetized"), progress=progress,
+    )  # fmt: skip
+    return part(found, time.perf_counter() - begin)
+
+
+def pulls(told: dict) -> dict:
+    """Distance of the repaired constants and of the instruments' from the truth, in stated errors."""
+    found = {n: (v - TRUTH[n]) / e for n, (v, e) in told["repaired"].items()}
+    true = {"amplifier_lag": {"tau": LAG}, "sensor_lag": dict(zip(("tau", "order2"), BUTTERWORTH, strict=True))}
+    for effect in told["effects"]:
+        for k, v in true.get(effect["name"], {}).items():
+            row = effect["parameters"][k]
+            found[f"{effect['name']}.{k}"] = (row["value"] - v) / row["stderr"]
+    return found
+
+
+def tell(density: str = "gauss", choices: Choices | None = None, progress=None, keep=lambda told: None) -> dict:
+    """Both acts; `keep` is called with what there is after each."""
+    told = {"density": density, "truth": TRUTH | {"amplifier": LAG, "sensor": CORNER}}
+    for name, instruments in ACTS.items():
+        told[name] = act(instruments, density, choices, progress)
+        if instruments:
+            told["pulls"] = pulls(told[name])
+        keep(told)
+    return told
 
 
 def main():
@@ -123,13 +143,19 @@ def main():
     prepare_jax()
     density = sys.argv[sys.argv.index("--density") + 1] if "--density" in sys.argv else "gauss"
     begin = time.perf_counter()
-    say = lambda text, step, chi2: print(f"{time.perf_counter() - begin:7.1f} s  {text} {step or ''} {'' if chi2 is None else f'{chi2:.4g}'}", flush=True)
-    told = tell(density, progress=lambda text, step, chi2: say(text, step, chi2) if step % 10 == 0 else None)
-    for act in ("command and reading", "shunt and calibration"):
-        print(f"\n{act}: {told[act]['verdict']}. {told[act]['message']}")
-    print("\ndistance from the truth in stated errors:", {k: round(v, 2) for k, v in told["pulls"].items()})
-    if density == "gauss":
-        Path(__file__).with_name("riddle.json").write_text(json.dumps(told, indent=1) + "\n")
+
+    def progress(text, step, chi2):
+        if step % 10 == 0:
+            print(f"{time.perf_counter() - begin:7.1f} s  {text} {step or ''} {'' if chi2 is None else f'{chi2:.4g}'}", flush=True)
+
+    def keep(told):
+        name = list(ACTS)[sum(n in told for n in ACTS) - 1]
+        print(f"\n{name}: {told[name]['verdict']}. {told[name]['message']}\n", flush=True)
+        if density == "gauss":
+            KEPT.write_text(json.dumps(told, indent=1) + "\n")
+
+    told = tell(density, progress=progress, keep=keep)
+    print("distance from the truth in stated errors:", {k: round(v, 2) for k, v in told["pulls"].items()})
 
 
 if __name__ == "__main__":
