@@ -17,7 +17,9 @@ from .experiments import instrument_request, next_experiment
 from .fit import REFINE_BETWEEN, REST_SETTLED, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, exchange, known_instruments
+from .learned import with_learned_term
 from .locate import where
+from .placebo import placebo
 from .screen import offset_score, screen
 from .setup import Choices, spectra_of
 
@@ -49,6 +51,7 @@ class Diagnosis:
     next_experiment: dict | None = None
     base: object = None
     repaired: object = None
+    placebo: dict | None = None
 
     def __str__(self):
         return f"{self.verdict}: {self.message}"
@@ -67,17 +70,18 @@ class Diagnosis:
             "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
             "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
             "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
-            "message": self.message, "base": self.base.as_dict() if self.base else None,
+            "placebo": self.placebo, "message": self.message, "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
         }  # fmt: skip
 
 
-def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choices: Choices = Choices(), progress=None) -> Diagnosis:
+def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choices: Choices = Choices(), progress=None, placebo_runs: int = 0) -> Diagnosis:
     """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
-    reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum). Returns a `Diagnosis`; raises `RecordingError` where a
-    recording cannot be used at all.
+    reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
+    `placebo_runs`: fits of recordings that lack nothing, to see how often the search would cry wolf. Returns a `Diagnosis`;
+    raises `RecordingError` where a recording cannot be used at all.
     """
     bench = load_bench(bench)
     say = progress or (lambda *a: None)
@@ -113,6 +117,10 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     state = _search(recordings, bench, base_now, candidates, choices, progress, check)
     common = {"floors": floors, "where": place, "absorbed": absorbed, "base": base}
     found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common)
+    if found.verdict == "unknown_at":
+        found = with_learned_term(found, base_now, recordings, bench, check, progress)
+    if placebo_runs > 0:
+        found = dataclasses.replace(found, placebo=placebo(state.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress))
     if zero is None:
         return found
     note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."

@@ -6,6 +6,7 @@ import pytest
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
+from fitting.placebo import placebo
 from fitting.setup import Choices, spectra_of
 from magjax.bench import load_bench
 from magjax.effects import SensorLag
@@ -27,13 +28,16 @@ def study(bench, effect=None, seed=5):
 
 def test_silent_where_nothing_is_missing(bench):
     runs, checks = study(bench)
-    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250))
+    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250), placebo_runs=2)
     assert found.verdict == "nothing_missing"
+    assert found.placebo["runs"] == 2 and found.placebo["false_alarms"] == 0 and 0 < max(found.placebo["highest_z"]) < 5.5
+    low = placebo(found.base, 1e-3, 1)  # everything scores above nothing
+    assert low["false_alarms"] == 1 and sum(low["named"].values()) == 1
     assert not found.effects and not found.groups and found.repaired is None
     assert max(abs(c.z) for c in found.candidates) < 5.5
     content = found.as_dict()
     assert {"verdict", "effects", "groups", "absorbed", "unknown", "data_problem", "candidates", "floors", "where", "check",
-            "next_experiment", "message", "base", "repaired"} == set(content)  # fmt: skip
+            "next_experiment", "placebo", "message", "base", "repaired"} == set(content)  # fmt: skip
 
 
 def test_names_a_concealed_sensor_filter(bench):

@@ -17,10 +17,7 @@ TONES = {
     "unknown_at": "warn",
     "data_problem": "bad",
 }
-RUN_PLACEBO = (
-    "To run it: simulate the model of this folder on the same drives (magjax simulate --model), add noise of the size in the table of "
-    "floors, and diagnose those recordings."
-)
+RUN_PLACEBO = "To run it: add --placebo 20 to the command that made this folder."
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
 
@@ -298,8 +295,8 @@ def placebo_section(placebo, verdict):
         if verdict == "data_problem":
             return None
         text = (
-            "Not run. The placebo simulates the repaired model on the same drives with fresh noise, runs the same search on those recordings, and "
-            "counts how often it names something more, though nothing more is there."
+            "Not run. The placebo simulates the final model on the same drives with fresh noise, fits and screens those recordings, and "
+            "counts how often something scores above the threshold, though nothing more is there."
         )
         return section(title, part(text=text), part(text=RUN_PLACEBO))
     number = next((int(placebo[k]) for k in ("runs", "searches", "count", "n", "trials") if k in placebo), 0)
@@ -309,7 +306,7 @@ def placebo_section(placebo, verdict):
         low, high = interval(false, number)
         parts.append(
             part(
-                text=f"In {number} searches on recordings simulated from the repaired model, {false} named something more, where nothing more was "
+                text=f"In {number} searches on recordings simulated from the final model, {false} named something more, where nothing more was "
                 f"({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)})."
             )  # fmt: skip
         )

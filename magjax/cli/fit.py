@@ -103,6 +103,8 @@ def run_diagnose(arguments) -> int:
     p = _common("diagnose", "Say what physics the model leaves out: where, what, how much better with it, what to record next.",
                 "magjax diagnose rec_*.csv --bench aa-050h --check check_*.csv --out result")  # fmt: skip
     p.add_argument("--calibration", nargs="+", default=[], help="the sensor moved by a known amount: files with reference_m beside the reading")
+    p.add_argument("--placebo", type=int, default=0, metavar="N",
+                   help="fit and screen N simulated recordings that lack nothing: how often the search would cry wolf (some seconds each)")  # fmt: skip
     options = p.parse_args(arguments)
     prepare_jax()
     from magjax.errors import RecordingError
@@ -122,7 +124,7 @@ def run_diagnose(arguments) -> int:
         checks = load_recordings(options.check, bench) if options.check else []
         with Progress(options.quiet or options.json) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
-                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress)  # fmt: skip
+                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress, placebo_runs=options.placebo)  # fmt: skip
     except RecordingError as error:
         found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
     content = found.as_dict()
@@ -137,6 +139,8 @@ def run_diagnose(arguments) -> int:
         print(found)
         for row in found.candidates[:8]:
             print(f"  {row.name:26s} z = {row.z:8.1f}   visible from {row.smallest_visible:.3g}")
+        if found.placebo:
+            print(f"  placebo: {found.placebo['false_alarms']} false alarms in {found.placebo['runs']} runs, highest z = {max(found.placebo['highest_z']):.1f}")
         if folder:
             print(f"\nresults in {folder} (report.html, diagnosis.json)")
     return 3 if found.verdict == "data_problem" else 0
