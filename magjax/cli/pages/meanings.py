@@ -67,6 +67,7 @@ DIAGNOSIS = {
     "where": "where the misfit of the base sits",
     "check": "one entry a check recording and channel",
     "next_experiment": "null, or the recording that best tells the rivals apart",
+    "placebo": "null, or what fits of recordings that lack nothing gave (--placebo)",
     "base": "the content of fit.json for the model without the effects",
     "repaired": "the same with them; null where nothing was added",
 }
@@ -115,6 +116,10 @@ INNER = {
     "next_experiment.drive.periods": "settled periods",
     "next_experiment.channels": "what to measure",
     "next_experiment.separates": "lists [first, second, probability that this recording tells them apart]",
+    "placebo.runs": "how many were fitted and screened",
+    "placebo.false_alarms": "in how many something scored above the threshold",
+    "placebo.named": "name -> how often",
+    "placebo.highest_z": "the highest |z| of each",
     "bootstrap.kind": "parametric (noise from its model) or blocks (periods of the recordings)",
     "bootstrap.draws": "refits",
     "bootstrap.settled": "those that settled; the others are left out",
