@@ -106,6 +106,7 @@ def model_as_dict(actuator, bench) -> dict:
         "output": actuator.output,
         "parameters": {n: float(np.asarray(v)) for n, (v, _) in actuator.parameters().items()},
         "effects": [e.name for e in actuator.effects],
+        **{e.name: e.settings() for e in actuator.effects if e.name == "learned_term"},
         "hysteresis": {
             "low": float(hysteresis.low), "high": float(hysteresis.high), "offset": float(hysteresis.offset),
             "rest": float(hysteresis.rest), "history": np.asarray(hysteresis.history).tolist(), "masses": np.asarray(hysteresis.masses).tolist(),

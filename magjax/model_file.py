@@ -15,6 +15,7 @@ from .preisach import Preisach
 def load_model(folder):
     """(actuator, bench) from a result folder or its model.json."""
     from .effects import CATALOGUE
+    from .effects.learned_term import LearnedTerm
 
     path = Path(folder)
     path = path / "model.json" if path.is_dir() else path
@@ -33,5 +34,6 @@ def load_model(folder):
     actuator = eqx.tree_at(lambda a: a.hysteresis, actuator, hysteresis)
     classes = {e.name: e for e in CATALOGUE}
     for name in content["effects"]:
-        actuator = actuator.with_effect(classes[name]())
+        effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else classes[name]()
+        actuator = actuator.with_effect(effect)
     return actuator.replace(content["parameters"]), bench

@@ -1,0 +1,271 @@
+"""The learned term of an `unknown_at`: its joint fit with everything else, what it is worth, how far it is known.
+
+The places that lead in `nonparametric` are fitted for real, all unknowns at once, the coefficients held by their prior.
+The one that foretells recordings left out one at a time best is kept, if it does so better than the model without it.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from magjax.effects.learned_term import OUTPUTS, UNITS, LearnedTerm
+from magjax.simulate import run_chain
+
+from .check import check_errors
+from .fit import finish
+from .joint import data_jacobian, data_residual, prior_matrix, solve
+from .nonparametric import Place, locate_places
+from .setup import build_problem
+from .uncertainty import WIDEN, covariance
+
+TRIED = 3  # leaders that are fitted jointly
+NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
+SIMPLER = 0.93  # of the evidence is enough for one variable in place of two
+KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
+RESIZED = 1.6  # change of the term's prior size that asks for another solution
+GRID = 121
+BEYOND = 0.25  # of the range seen, shown on either side of it
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """A term fitted jointly. `left_out`: chi2 per datum of recordings left out, (before, after); `covariance`: of the
+    coefficients; `share` of the excess misfit explained; `places`: all boundaries, by the evidence; `rivals`: boundaries
+    whose joint fits do as well."""
+
+    place: Place
+    term: LearnedTerm
+    result: object
+    covariance: np.ndarray = dataclasses.field(repr=False)
+    left_out: tuple[float, float]
+    share: float
+    places: tuple = dataclasses.field(repr=False, default=())
+    rivals: tuple = ()
+
+    @property
+    def worth(self) -> bool:
+        """Whether it foretells recordings that took no part better."""
+        before, after = self.left_out
+        return after < 1 + KEPT * (before - 1)
+
+
+def left_out(problem, solution) -> np.ndarray:
+    """chi2 per datum of each recording foretold from the others, by the linear model about the optimum.
+
+    With H = J (J'J + P)^-1 J' the residual of the rows of a recording fitted without them is (I - H_kk)^-1 r_k.
+    """
+    n = problem.layout.density_unknowns
+    J, r = data_jacobian(problem, solution.z), data_residual(problem, solution.z)
+    free = np.append(solution.z[:n] > 0, np.ones(len(solution.z) - n, bool))
+    normal = J.T @ J + prior_matrix(problem, solution.weights)
+    J, normal = J[:, free], normal[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.diag(normal))
+    inverse = np.linalg.inv(normal * scale[:, None] * scale + 1e-11 * np.eye(len(scale))) * scale[:, None] * scale
+    R, H = problem.target.lines.shape
+    owner = np.concatenate([np.repeat(np.arange(R), H), np.repeat(np.arange(R), H - 1)])
+    finite = np.isfinite(np.asarray(problem.target.deviations))
+    rows = []
+    for k in range(R):
+        mine = owner == k
+        hat = J[mine] @ inverse @ J[mine].T
+        # a direction that only this recording shows is not foretold at all: it counts with what its prior leaves
+        alone = np.linalg.solve((1 + 1e-9) * np.eye(len(hat)) - hat, r[mine])
+        rows.append(float(alone @ alone) / (2 * finite[k].sum() - finite[k, 0]))
+    return np.asarray(rows)
+
+
+def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
+    """Fit a place's term jointly with density, parameters and adopted effects of a `FitResult`."""
+    say = progress or (lambda *a: None)
+    n = base.problem.layout.density_unknowns
+    names = (*base.problem.layout.names, *(f"effects.learned_term.{c}" for c in place.term.parameters()))
+    term, start, weights, z = place.term, base.solution.z, base.solution.weights, None
+    before = base.chi2_per_sample * base.data_count
+    for again in range(2):
+        actuator = base.actuator.with_effect(term)
+        problem, z = build_problem(base.spectra, actuator, bench, names, base.choices, start[: n + 1])
+        z[len(z) - problem.layout.memories :] = start[len(start) - problem.layout.memories :]
+        if again:
+            z[n + 1 : n + 1 + len(names)] = moved
+        solution = solve(
+            problem, z, weights, max_jacobians=base.choices.max_jacobians,
+            progress=lambda k, c: say(f"learning {' and '.join(place.variables)} at the {place.block}", k, c),
+        )  # fmt: skip
+        first = problem.layout.index(names[len(base.problem.layout.names)])
+        index = slice(first, first + len(term.coefficients))
+        cov = covariance(solution.normal, solution.z, n)
+        values = np.array([float(problem.layout.value(name, jnp.asarray(solution.z))) for name in names[len(base.problem.layout.names) :]])
+        slopes = np.asarray(problem.layout.scales)[index.start - n - 1 : index.stop - n - 1]
+        spread = cov[index, index] * slopes[:, None] * slopes
+        deviation = np.asarray(term.deviation)
+        known = np.clip(1 - np.diag(spread) / deviation**2, 0.0, 1.0)  # of each coefficient, how much is the data's word
+        factor = float(np.clip(np.sqrt(np.sum((values / deviation) ** 2) / max(known.sum(), 0.5)), 0.05, 20.0))
+        if again or 1 / RESIZED < factor < RESIZED:
+            break
+        term = dataclasses.replace(term, size=term.size * factor)
+        moved = solution.z[n + 1 : n + 1 + len(names)].copy()
+        moved[index.start - n - 1 : index.stop - n - 1] /= factor
+        start, weights = solution.z, solution.weights
+        kept = {name: float(problem.layout.value(name, jnp.asarray(start))) for name in base.problem.layout.names}
+        moved[: len(kept)] = 0.0
+        base = dataclasses.replace(base, actuator=base.actuator.replace(kept))
+    result = finish(problem, solution, base.choices, bench, recordings)
+    fitted = result.actuator.effect("learned_term")
+    after = result.chi2_per_sample * result.data_count
+    share = (before - after) / max(before - result.data_count, 1e-9)
+    widened = spread * WIDEN**2 * max(result.chi2_per_sample, 1.0)
+    others = (float(left_out(base.problem, base.solution).mean()), float(left_out(problem, solution).mean()))
+    return Learned(place, fitted, result, widened, others, float(np.clip(share, 0.0, 1.0)))
+
+
+def chosen_places(places) -> list[Place]:
+    """Places worth a joint fit: the best of each block whose evidence comes near the first, one variable before two."""
+    best = places[0].evidence
+    chosen = []
+    for block in dict.fromkeys(p.block for p in places):
+        mine = [p for p in places if p.block == block]
+        simple = [p for p in mine if len(p.variables) == 1 and p.evidence > SIMPLER * mine[0].evidence]
+        if mine[0].evidence > NEAR * best:
+            chosen.append(simple[0] if simple else mine[0])
+    return chosen[:TRIED]
+
+
+def learn(base, recordings, bench, progress=None) -> Learned | None:
+    """The term that serves best beside a fit, or None where none foretells left-out recordings better."""
+    say = progress or (lambda *a: None)
+    places = [p for p in locate_places(base, say) if p.evidence > 0]
+    if not places:
+        return None
+    tried = [fit_term(base, place, recordings, bench, progress) for place in chosen_places(places)]
+    tried = sorted((t for t in tried if np.isfinite(t.result.chi2_per_sample)), key=lambda t: t.left_out[1])
+    if not tried or not tried[0].worth:
+        return None
+    best = tried[0]
+    near = 1 + 1.3 * (best.left_out[1] - 1) + 0.1
+    rivals = tuple(t.place for t in tried[1:] if t.left_out[1] < near)
+    return dataclasses.replace(best, places=tuple(places), rivals=rivals)
+
+
+def band(learned: Learned, *values):
+    """The learned function and its standard deviation at some values of its variables, unit of the block's output.
+
+    Centred on the range seen: a constant is not told from the base. Beyond the range the deviation grows with the
+    distance as the slope of the prior does.
+    """
+    term = learned.term
+    waves, outside = (np.asarray(x) for x in term.basis(*(np.asarray(v, float) for v in values), xp=np))
+    axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(term.low, term.high, strict=True)), indexing="ij")
+    middle = term.basis(*axes, xp=np)[0].reshape(len(waves), -1).mean(axis=1)
+    shape = waves.shape[1:]
+    rows = waves.reshape(len(waves), -1) - middle[:, None]
+    size = float(term.size)
+    value = size * (np.array([float(c) for c in term.coefficients]) @ rows)
+    variance = np.einsum("ki,kl,li->i", rows, learned.covariance, rows, optimize=True) + np.sum(outside.reshape(len(outside), -1) ** 2, axis=0) / learned.place.length**2
+    return value.reshape(shape), size * np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
+
+
+@eqx.filter_jit
+def _sensitivities(actuator, drive, dt, periods, corners):
+    """Reading, its derivative in every coefficient and in every end's slope, (coefficients + ends, time)."""
+    term = actuator.effect("learned_term")
+    number = len(term.coefficients)
+
+    def reading(x):
+        changed = dataclasses.replace(term, coefficients=tuple(x[:number]), beyond=x[number:])
+        return run_chain(actuator.with_effect(changed), drive, dt, periods, corners).reading
+
+    at = jnp.concatenate([jnp.stack(term.coefficients), term.beyond])
+    value, push = jax.linearize(reading, at)
+    return value, jax.lax.map(push, jnp.eye(len(at)), batch_size=8)
+
+
+def prediction_interval(learned: Learned, drive, dt: float, periods: int = 3, corners: int = 8):
+    """One settled period of the reading on a periodic drive, and its standard deviation by what the term leaves open."""
+    value, rows = (np.asarray(x) for x in _sensitivities(learned.result.actuator, jnp.asarray(drive), jnp.asarray(dt), periods, corners))
+    number = len(learned.term.coefficients)
+    ends = np.sum(rows[number:] ** 2, axis=0) / learned.place.length**2
+    return value, np.sqrt(np.einsum("ki,kl,li->i", rows[:number], learned.covariance, rows[:number], optimize=True) + ends)
+
+
+def region(learned: Learned):
+    """The stretch of the first variable that holds most of the function's bending: (low, high, share of the range)."""
+    term = learned.term
+    first = np.linspace(float(term.low[0]), float(term.high[0]), 201)
+    others = [np.full_like(first, 0.5 * float(a + b)) for a, b in zip(term.low[1:], term.high[1:], strict=True)]
+    if len(others) and term.variables[1].endswith("_rate") is False:
+        others = [np.full_like(first, float(b)) for b in term.high[1:]]
+    value = band(learned, first, *others)[0]
+    slope = np.gradient(value)
+    power = (slope - np.median(slope)) ** 2
+    total, best = np.cumsum(power) / max(power.sum(), 1e-300), (0, 200)
+    total = np.concatenate([[0.0], total])
+    for i in range(201):
+        j = int(np.searchsorted(total, total[i] + 0.8))
+        if j <= 201 and j - i < best[1] - best[0]:
+            best = (i, min(j, 200))
+    return float(first[best[0]]), float(first[best[1]]), (best[1] - best[0]) / 200
+
+
+def described(learned: Learned) -> dict:
+    """What diagnosis.json says of it, beside the block: variables, function with its band, worth, rivals."""
+    term = learned.term
+    low, high = np.asarray(term.low), np.asarray(term.high)
+    reach = BEYOND * (high[0] - low[0])
+    x = np.linspace(low[0] - reach, high[0] + reach, GRID)
+    levels = [None] if len(low) == 1 else [float(low[1] + s * (high[1] - low[1])) for s in (0.1, 0.5, 0.9)]
+    slices = []
+    for level in levels:
+        value, deviation = band(learned, *([x] if level is None else [x, np.full_like(x, level)]))
+        slices.append({"at": level, "value": value.tolist(), "low": (value - 1.96 * deviation).tolist(), "high": (value + 1.96 * deviation).tolist()})
+    unit = OUTPUTS[term.place]
+    unit = {"m": "m", "T": "T"}.get(learned.result.recordings[0].unit, "A/m") if unit == "reading" else unit
+    units = [UNITS[v].replace("reading", learned.result.recordings[0].unit) for v in term.variables]
+    axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(low, high, strict=True)), indexing="ij")
+    return {
+        "variables": list(term.variables), "variable_units": units, "unit": unit, "share": learned.share,
+        "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
+        "left_out": list(learned.left_out), "bends_over": learned.place.length,
+        "function": {"x": x.tolist(), "slices": slices},
+        "boundaries": [
+            {"block": p.block, "variables": list(p.variables), "evidence": p.evidence, "share": p.share, "visibility": p.visibility}
+            for p in learned.places
+        ],
+        "rivals": [{"block": p.block, "variables": list(p.variables)} for p in learned.rivals],
+    }  # fmt: skip
+
+
+def words(name: str) -> str:
+    """A variable's name as people say it."""
+    return name.replace("_", " ")
+
+
+def with_learned_term(found, base, recordings, bench, check=(), progress=None):
+    """An `unknown_at` with the term that models it, where one is worth it: block and region by it, the repaired model with
+    it, check recordings before and after. `found`: a `Diagnosis`; `base`: the fit that it stands beside."""
+    learned = learn(base, recordings, bench, progress)
+    if learned is None:
+        return dataclasses.replace(found, message=found.message + " No smooth function of the signals there foretells recordings left out any better.")
+    rows = tuple(check_errors(found.base.actuator, learned.result.actuator, check, bench)) if check else ()
+    gained = [r["rms_after"] / max(r["rms_before"], 1e-300) for r in rows]
+    if gained and np.mean(np.square(gained)) > 1:
+        return dataclasses.replace(found, message=found.message + " A smooth function learned from them predicts the check recordings worse, so it is not kept.")
+    more = described(learned)
+    start, end, part = region(learned)
+    place, unit = learned.place, more["variable_units"][0]
+    where = f"all over the range of the {words(place.variables[0])}" if part > 0.6 else f"{words(place.variables[0])} {start:.3g} .. {end:.3g} {unit}"
+    unknown = {**(found.unknown or {}), "block": place.block, "region": where, **more}
+    nearest = f"{learned.share:.0%} of the excess"
+    text = (
+        f"something is missing that no effect of the catalogue explains. It acts like a function of {' and '.join(words(v) for v in place.variables)} "
+        f"at the {place.block} ({where}): learned as one, it takes {nearest} (chi2/N {base.chi2_per_sample:.3g} -> {learned.result.chi2_per_sample:.3g}; "
+        f"recordings left out {learned.left_out[0]:.3g} -> {learned.left_out[1]:.3g})."
+    )
+    if learned.rivals:
+        text += f" Not told from it: {'; '.join(f'{p.block} ({" and ".join(words(v) for v in p.variables)})' for p in learned.rivals)}."
+    better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
+    text += f" On check recordings: {better}." if better else ""
+    text += " Beyond the range seen its interval widens."
+    return dataclasses.replace(found, message=text, unknown=unknown, check=rows or found.check, repaired=learned.result)

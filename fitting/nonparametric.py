@@ -1,0 +1,272 @@
+"""What no named effect explains: in which block it acts, as a function of what, and that function itself.
+
+For every block boundary and every one or two local variables there, the columns of a smooth function's coefficients
+(cosines under the prior of a Gaussian process) are projected off the tangent space of the fit. The evidence of the linear
+model says which boundary and variables serve, how smooth the function is and how large; the leaders are fitted
+jointly with everything else, and the term is kept only where recordings left out one at a time are foretold better.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from magjax.chain import Timeline
+from magjax.constants import MU0
+from magjax.effects.base import AbstractEffect
+from magjax.effects.learned_term import PAD, LearnedTerm
+from magjax.simulate import finish_chain, run_chain
+
+from .screen import Projector, _march_columns, _steady_state, _trajectory, changed_drive
+from .model import whitened
+
+ONE = 48  # cosines of a function of one variable
+FINE = 160  # where none of these serves: of one variable of the sensor or the strain
+TWO = (10, 7)
+IN_STEP = (10, 6)  # inside the step every cosine costs in every iteration
+LENGTHS = (0.5, 0.25, 0.12, 0.06, 0.03, 0.015)  # of the range, over which a function bends
+FINER_GAIN = 5.0  # of evidence, that more cosines must bring
+KNEE = 0.1  # of the largest rate, below which a rate counts linearly
+
+SETS = (
+    ("source", ("current",)), ("source", ("current_rate",)), ("source", ("current", "current_rate")),
+    ("coil", ("flux_rate",)), ("coil", ("flux_rate", "magnetization")), ("coil", ("flux_rate", "field")),
+    ("hysteresis", ("magnetization",)), ("hysteresis", ("field_rate",)), ("hysteresis", ("field", "magnetization")),
+    ("hysteresis", ("field_rate", "magnetization")),
+    ("magnetostriction", ("magnetization",)), ("magnetostriction", ("field",)), ("magnetostriction", ("magnetization", "field")),
+    ("magnetostriction", ("magnetization", "magnetization_rate")),
+    ("mechanics", ("displacement",)), ("mechanics", ("displacement_rate",)), ("mechanics", ("displacement", "displacement_rate")),
+    ("mechanics", ("stretch", "magnetization")),
+    ("sensor", ("reading",)), ("sensor", ("reading_rate",)), ("sensor", ("reading", "reading_rate")), ("sensor", ("current_rate",)),
+    ("sensor", ("current", "current_rate")),
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """How well a function of some variables at a block's output serves, to first order: `evidence` over none, `share` of
+    the misfit explained, `length` of the range over which it bends, `size` (unit of the output), `term` at null."""
+
+    block: str
+    variables: tuple
+    evidence: float
+    share: float
+    length: float
+    size: float
+    visibility: float
+    term: LearnedTerm = dataclasses.field(repr=False)
+
+
+@eqx.filter_jit
+def _signals(predictor, actuator):
+    """Every signal of the last period of every recording with its rates, grid by grid."""
+
+    def one(drive, dt):
+        s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners)
+        line = Timeline(dt, drive.shape[0], True)
+        found = {"current": s.current, "field": s.relay_field, "magnetization": s.magnetization, "reading": s.reading}
+        if s.displacement is not None:
+            found |= {"displacement": s.displacement, "stretch": s.displacement - s.free_displacement}
+        rates = {f"{n}_rate": line.derivative(found[n]) for n in ("current", "field", "magnetization", "displacement", "reading") if n in found}
+        return {**found, **rates, "flux_rate": line.derivative(s.flux_density)}
+
+    return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
+
+
+def _step_signals(scheme, field, magnetization, current, dt):
+    """What an effect inside the step sees, over the whole march of every recording, (recordings, time)."""
+    X = field + magnetization
+    back = np.concatenate([X[:, :1], X[:, :1], X], axis=1)
+    change = 1.5 * X - 2 * back[:, 1:-1] + 0.5 * back[:, :-2] if scheme == "bdf2" else X - back[:, 1:-1]
+    pace = dt[:, None]
+    moved = np.diff(field, axis=1, prepend=field[:, :1])
+    return {"field": field, "magnetization": magnetization, "flux_rate": MU0 * change / pace, "field_rate": moved / pace}
+
+
+def prior_deviations(counts, length: float) -> np.ndarray:
+    """Standard deviation of each product of cosines: the spectrum of exp(-d^2 / (2 length^2)), of mean variance 1."""
+    whole = np.ones(1)
+    for count in counts:
+        k = np.arange(count)
+        power = np.exp(-0.5 * (k * np.pi * length / (1 + 2 * PAD)) ** 2)
+        power /= power[0] + 0.5 * power[1:].sum()
+        whole = (whole[:, None] * power[None]).ravel()
+    return np.sqrt(np.maximum(whole, 1e-16))
+
+
+def null_term(block, variables, signals, actuator, counts) -> LearnedTerm:
+    """A term at null over the range of the signals, in the natural unit of its block."""
+    ends = np.array([[signals[v].min(), signals[v].max()] for v in variables])
+    knee = np.array([KNEE * np.abs(signals[v]).max() if v.endswith("_rate") else 0.0 for v in variables])
+    natural = {"source": np.ptp(signals["current"]), "coil": np.ptp(signals["field"]), "hysteresis": np.ptp(signals["field"])}
+    reach = np.ptp(signals["reading"]) if actuator.magnetostriction is None else float(actuator.magnetostriction.reach)
+    size = 1e-3 * natural.get(block, reach)
+    return LearnedTerm.null(block, variables, ends[:, 0], ends[:, 1], counts, np.ones(int(np.prod(counts))), size, knee)
+
+
+class _VirtualSignal(AbstractEffect):
+    """Signals added at the boundaries behind the hysteresis, (time,): free displacement, force, reading."""
+
+    added: jax.Array
+    force: jax.Array
+    read: jax.Array
+
+    def strain(self, free_displacement, magnetization, field, line, actuator):
+        return free_displacement + self.added
+
+    def displacement(self, displacement, free_displacement, signals, line, actuator):
+        return displacement + line.filter(self.force, actuator.mechanics.response)
+
+    def reading(self, reading, signals, line, actuator):
+        return reading + self.read
+
+
+@eqx.filter_jit
+def _late_columns(predictor, actuator, states, directions):
+    """Change of the lines by virtual signals behind the hysteresis, to first order, (columns, recordings, harmonics + 1).
+
+    `directions`: per grid, (free displacement, force, reading), (columns, recordings, grid) each."""
+
+    def lines_of(signals):
+        def one(drive, dt, H, M, parts):
+            line = Timeline(dt, drive.shape[0], True)
+            changed = dataclasses.replace(actuator, effects=(*actuator.effects, _VirtualSignal(*parts)))
+            s = finish_chain(changed, line, drive, changed_drive(actuator, drive, line), H, M, H, H, jnp.zeros(()))
+            return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / drive.shape[0]
+
+        grids = zip(predictor.drives, predictor.steps, states, signals, strict=True)
+        return jnp.concatenate([jax.vmap(one)(d, t, H, M, p) for d, t, (H, M), p in grids])[np.asarray(predictor.index)]
+
+    origin = jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), directions)
+    _, push = jax.linearize(lines_of, origin)
+    return jax.lax.map(push, directions, batch_size=8)
+
+
+class Tangents:
+    """Columns of learned terms about a fit, and what is left of them off its tangent space."""
+
+    def __init__(self, result):
+        self.problem, self.solution = result.problem, result.refined
+        self.actuator = self.problem.layout.actuator(self.problem.template, jnp.asarray(self.solution.z))
+        self.predictor = self.problem.predictors[0]
+        self.projector = Projector(self.problem, self.solution)
+        self.last = _signals(self.predictor, self.actuator)
+        self.signals = {n: np.concatenate([np.asarray(g[n]).ravel() for g in self.last]) for n in self.last[0]}
+        self.states = _steady_state(self.predictor, self.actuator)
+        self.trajectory = _trajectory(self.predictor, self.actuator)
+        self.marched = [_step_signals(self.actuator.coil.scheme, *(np.asarray(x) for x in part)) for part in self.trajectory]
+        self.zero = eqx.tree_at(lambda t: t.lines, self.problem.target, jnp.zeros_like(self.problem.target.lines))
+
+    def columns(self, term) -> np.ndarray:
+        """d (whitened misfit) / d coefficients, (data, coefficients)."""
+        p, a = self.predictor, self.actuator
+        if term.in_step:
+            waves = [float(term.size) * self._waves(term, g) for g in self.marched]
+            still = [np.zeros_like(w) for w in waves]
+            at = 2 if term.place == "coil" else 0
+            rows = tuple(tuple(w if k == at else z for k in range(3)) for w, z in zip(waves, still, strict=True))
+            changes = tuple(np.zeros((len(term.coefficients), *d.shape)) for d in p.drives)
+            lines = _march_columns(p, a, (rows, changes))
+        else:
+            waves = tuple(float(term.size) * self._waves(term, g) for g in self.last)
+            if term.place == "source":
+                shapes = [(len(w), *np.shape(part[0])) for w, part in zip(waves, self.trajectory, strict=True)]
+                rows = tuple(tuple(np.zeros(shape) for _ in range(3)) for shape in shapes)
+                lines = _march_columns(p, a, (rows, waves))
+            else:
+                at = ("magnetostriction", "mechanics", "sensor").index(term.place)
+                given = tuple(tuple(w if k == at else np.zeros_like(w) for k in range(3)) for w in waves)
+                lines = _late_columns(p, a, self.states, given)
+        return np.stack([np.asarray(whitened(line, self.zero)) for line in lines], axis=1)
+
+    def _waves(self, term, signals):
+        return term.basis(*(np.asarray(signals[v]) for v in term.variables), xp=np)[0]
+
+    def project(self, columns) -> np.ndarray:
+        """The part of data columns that the fit cannot make."""
+        whole = np.concatenate([columns, np.zeros((len(self.projector.raw) - self.projector.count, columns.shape[1]))])
+        for _ in range(2):
+            whole = whole - self.projector.basis @ (self.projector.basis.T @ whole)
+        return whole
+
+
+def evidence(columns, residual, counts, freedom: float):
+    """Best (evidence over no term, share of the misfit explained, length, size relative to the columns').
+
+    The linear model residual + columns c = noise, c ~ size^2 deviation^2, the noise of unit variance or as much larger
+    as the residual says: a misfit in the thousands must not be taken for knowledge.
+    """
+    normal, push = columns.T @ columns, columns.T @ residual
+    total = float(residual @ residual)
+
+    def gain(values, along, variance):
+        left = total - float(np.sum(variance * along**2 / (1 + variance * values)))
+        noise = max(left / freedom, 1.0)
+        return -0.5 * freedom * np.log(noise) - 0.5 * left / noise - 0.5 * float(np.sum(np.log1p(variance * values))), left
+
+    flat = max(total / freedom, 1.0)
+    nothing = -0.5 * freedom * np.log(flat) - 0.5 * total / flat
+    best = (-np.inf, 0.0, 0.0, 0.0)
+    for length in LENGTHS:
+        deviation = prior_deviations(counts, length)
+        values, vectors = np.linalg.eigh(normal * deviation * deviation[:, None])
+        values, along = np.maximum(values, 0.0), vectors.T @ (push * deviation)
+        for size in np.geomspace(1e-3, 1e3, 37):
+            found, left = gain(values, along, size**2)
+            if found - nothing > best[0]:
+                best = (found - nothing, 1 - left / total, length, size)
+    return tuple(float(b) for b in best)
+
+
+def applicable_sets(actuator, signals, quasistatic: bool):
+    """Boundaries and variables that this actuator has."""
+    for block, variables in SETS:
+        if block in ("magnetostriction", "mechanics") and getattr(actuator, block) is None:
+            continue
+        if any(v not in signals or np.ptp(signals[v]) == 0 for v in variables):
+            continue
+        if quasistatic and any(v.endswith("_rate") for v in variables):
+            continue
+        yield block, variables
+
+
+def locate_places(result, say=lambda *a: None) -> list[Place]:
+    """Every boundary with its variables by the evidence of a smooth function there, best first."""
+    tangents = Tangents(result)
+    residual = tangents.projector.residual
+    freedom = max(len(residual) - tangents.projector.basis.shape[1], 10)
+    found = []
+    for block, variables in applicable_sets(tangents.actuator, tangents.signals, tangents.problem.quasistatic):
+        say(f"a function of {' and '.join(variables)} at the {block}", 0, None)
+        for counts in _resolutions(block, variables):
+            term = null_term(block, variables, tangents.signals, tangents.actuator, counts)
+            columns = tangents.columns(term)
+            if not np.isfinite(columns).all():
+                continue
+            off = tangents.project(columns)
+            gain, share, length, size = evidence(off, residual, counts, freedom)
+            if length == 0.0:
+                continue
+            weighed = prior_deviations(counts, length)
+            visible = float(np.linalg.norm(off * weighed) / max(np.linalg.norm(columns * weighed), 1e-300))
+            if found and found[-1].variables == variables and found[-1].block == block:
+                if gain < found[-1].evidence + FINER_GAIN:
+                    continue
+                found.pop()
+            found.append(Place(block, variables, gain, share, length, size * float(term.size), visible, _with_prior(term, length, size)))
+    return sorted(found, key=lambda p: -p.evidence)
+
+
+def _with_prior(term, length, size):
+    deviation = prior_deviations(term.counts, length)
+    return dataclasses.replace(term, deviation=jnp.asarray(deviation), size=term.size * size)
+
+
+def _resolutions(block, variables):
+    if block in ("coil", "hysteresis"):
+        return [IN_STEP if len(variables) == 2 else (2 * IN_STEP[0],)]
+    if len(variables) == 2:
+        return [TWO]
+    return [(ONE,), (FINE,)] if block in ("sensor", "magnetostriction") and not variables[0].endswith("_rate") else [(ONE,)]

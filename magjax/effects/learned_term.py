@@ -1,0 +1,175 @@
+"""any block: a smooth function of one or two local variables, learned from recordings that no named effect explains.
+
+It is not of the catalogue: nothing is named by it. A diagnosis that ends in `unknown_at` fits it, so that the model
+predicts what it cannot explain, and states how far its function is known.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..param import ParameterInfo, as_float_array
+from .base import AbstractEffect
+from .forces import with_force
+
+PAD = 0.15  # of the range seen, by which the cosines' own period reaches beyond it: no slope is forced at its ends
+UNITS = {
+    "current": "A", "current_rate": "A/s", "field": "A/m", "field_rate": "A/m/s", "magnetization": "A/m", "magnetization_rate": "A/m/s",
+    "flux_rate": "T/s", "displacement": "m", "displacement_rate": "m/s", "stretch": "m", "reading": "reading", "reading_rate": "reading/s",
+}  # fmt: skip
+PLACES = {
+    "source": ("current", "current_rate"),
+    "coil": ("flux_rate", "magnetization", "field"),
+    "hysteresis": ("field", "magnetization", "field_rate"),
+    "magnetostriction": ("magnetization", "field", "magnetization_rate", "field_rate"),
+    "mechanics": ("displacement", "displacement_rate", "magnetization", "stretch"),
+    "sensor": ("reading", "reading_rate", "current", "current_rate"),
+}
+OUTPUTS = {"source": "A", "coil": "A/m", "hysteresis": "A/m", "magnetostriction": "m", "mechanics": "m", "sensor": "reading"}
+
+
+class LearnedTerm(AbstractEffect):
+    """What a block adds to its output: size * sum of coefficients * products of cosines in scaled variables.
+
+    A variable x is scaled to s in 0..1 over the range seen, `low` to `high`, rates as arsinh(x / knee); the cosines are
+    cos(k pi (s + PAD)/(1 + 2 PAD)). Beyond the range the function stays as at its edge, plus `beyond` times the scaled
+    distance: zero, but uncertain. `deviation`: prior standard deviation of each coefficient, which falls with k as the
+    spectrum of a smooth random function. Added: to the current (A), to the loss or to the relays' field (A/m), to the
+    free displacement (m), as a force in metres of free displacement, or to the reading.
+    """
+
+    coefficients: tuple[Float[Array, ""], ...]
+    deviation: Float[Array, " coefficients"]
+    low: Float[Array, " variables"]
+    high: Float[Array, " variables"]
+    knee: Float[Array, " variables"]
+    size: Float[Array, ""]
+    beyond: Float[Array, " ends"]
+    place: str = eqx.field(static=True)
+    variables: tuple[str, ...] = eqx.field(static=True)
+    counts: tuple[int, ...] = eqx.field(static=True)
+
+    name: ClassVar[str] = "learned_term"
+    law: ClassVar[str] = "x -> x + size sum_k c_k prod_v cos(k_v pi (s_v + PAD)/(1 + 2 PAD))"
+    source: ClassVar[str] = "A. Solin, S. Sarkka, Stat. Comput. 30 (2020) 419: Gaussian processes by cosines of a longer range"
+    signature: ClassVar[str] = "what no named effect explains"
+    amplitude: ClassVar[str] = "c0"
+
+    @staticmethod
+    def null(place, variables, low, high, counts, deviation, size, knee=None, beyond=None, coefficients=None) -> "LearnedTerm":
+        """A term of given place and variables whose coefficients are zero unless given."""
+        number = int(np.prod(counts))
+        values = np.zeros(number) if coefficients is None else np.asarray(coefficients, float)
+        return LearnedTerm(
+            tuple(as_float_array(v) for v in values), as_float_array(deviation), as_float_array(low), as_float_array(high),
+            as_float_array(np.zeros(len(variables)) if knee is None else knee), as_float_array(size),
+            as_float_array(np.zeros(2 * len(variables)) if beyond is None else beyond), str(place), tuple(variables), tuple(int(c) for c in counts),
+        )  # fmt: skip
+
+    def settings(self) -> dict:
+        """All of it but the coefficients, for model.json."""
+        arrays = {n: np.asarray(getattr(self, n)).tolist() for n in ("deviation", "low", "high", "knee", "size", "beyond")}
+        return {"place": self.place, "variables": list(self.variables), "counts": list(self.counts), **arrays}
+
+    @property
+    def block(self) -> str:
+        """The block at whose output it adds."""
+        return self.place
+
+    @property
+    def in_step(self) -> bool:
+        """Whether it is solved inside the step of (4)."""
+        return self.place in ("coil", "hysteresis")
+
+    def __getattr__(self, name):
+        """A coefficient by the name of its parameter, c0, c1, ..."""
+        if name[:1] == "c" and name[1:].isdigit() and int(name[1:]) < len(self.coefficients):
+            return self.coefficients[int(name[1:])]
+        raise AttributeError(f"learned_term has no {name}")
+
+    def parameters(self) -> dict:
+        """c0, c1, ...: held by their prior deviation (a shape has two of its scales)."""
+        meaning = "coefficient of the learned function"
+        return {
+            f"c{k}": ParameterInfo("1", meaning, scale=0.5 * float(d), null=0.0, shape=True) for k, d in enumerate(np.asarray(self.deviation))
+        }
+
+    def basis(self, *values, xp=jnp):
+        """Every product of cosines at some values, (coefficients, ...), and the scaled distances beyond, (ends, ...).
+
+        `xp`: jax.numpy or numpy."""
+        product, outside = None, []
+        for x, low, high, knee, count in zip(values, self.low, self.high, self.knee, self.counts, strict=True):
+            low, high, knee = (xp.asarray(v) for v in (low, high, knee))
+            width = xp.where(knee > 0, knee, 1.0)
+            x, low, high = (xp.where(knee > 0, xp.arcsinh(v / width), v) for v in (x, low, high))
+            s = (x - low) / (high - low)
+            outside += [xp.maximum(-s, 0.0), xp.maximum(s - 1.0, 0.0)]
+            angle = (xp.clip(s, 0.0, 1.0) + PAD) * (np.pi / (1 + 2 * PAD))
+            waves = xp.cos(xp.arange(count).reshape((count,) + (1,) * angle.ndim) * angle)
+            product = waves if product is None else (product[:, None] * waves[None]).reshape((-1, *angle.shape))
+        return product, xp.stack(outside)
+
+    def value(self, *values):
+        """The function at some values of its variables, unit of the block's output."""
+        waves, outside = self.basis(*values)
+        return self.size * (jnp.tensordot(jnp.stack(self.coefficients), waves, 1) + jnp.tensordot(self.beyond, outside, 1))
+
+    def _of(self, table):
+        return self.value(*(table[v]() for v in self.variables))
+
+    def drive(self, current, line, actuator):
+        """Current with the term, A."""
+        if self.place != "source":
+            return current
+        return current + self._of({"current": lambda: current, "current_rate": lambda: line.derivative(current)})
+
+    def field_shift(self, trial, state, actuator):
+        """Loss (coil) or shift of the relays' field (hysteresis), A/m."""
+        return self._of(
+            {
+                "field": lambda: trial.field, "magnetization": lambda: trial.magnetization, "flux_rate": lambda: trial.flux_rate,
+                "field_rate": lambda: trial.field_rate,
+            }
+        )  # fmt: skip
+
+    def strain(self, free_displacement, magnetization, field, line, actuator):
+        """Free displacement with the term, m."""
+        if self.place != "magnetostriction":
+            return free_displacement
+        return free_displacement + self._of(
+            {
+                "magnetization": lambda: magnetization, "field": lambda: field,
+                "magnetization_rate": lambda: line.derivative(magnetization), "field_rate": lambda: line.derivative(field),
+            }
+        )  # fmt: skip
+
+    def displacement(self, displacement, free_displacement, signals, line, actuator):
+        """Displacement under the term as a force, m."""
+        if self.place != "mechanics":
+            return displacement
+
+        def force(y):
+            return self._of(
+                {
+                    "displacement": lambda: y, "displacement_rate": lambda: line.derivative(y), "magnetization": lambda: signals["magnetization"],
+                    "stretch": lambda: y - free_displacement,
+                }
+            )  # fmt: skip
+
+        return with_force(displacement, force, line, actuator)
+
+    def reading(self, reading, signals, line, actuator):
+        """Reading with the term."""
+        if self.place != "sensor":
+            return reading
+        current = signals["current"]
+        return reading + self._of(
+            {
+                "reading": lambda: reading, "reading_rate": lambda: line.derivative(reading), "current": lambda: current,
+                "current_rate": lambda: line.derivative(current),
+            }
+        )  # fmt: skip
