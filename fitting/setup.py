@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.errors import ConfigurationError, RecordingError
-from magjax.param import parameters_of
 from magjax.extrema import nesting
+from magjax.param import parameters_of
 
 from .density import cell_basis, hat_basis
 from .joint import Problem

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magjax.errors import ConfigurationError
-from magjax.preisach import Preisach, density_masses, forc_masses, relay_magnetization
 from magjax.extrema import nesting, wiped
+from magjax.preisach import Preisach, density_masses, forc_masses, relay_magnetization
 from tests.oracle.slow import SlowPreisach
 
 LOW, HIGH = -1000.0, 2000.0

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..errors import ConfigurationError
 
-
 PROBABILITIES = ("drop", "flip", "merge", "duplicate")
 
 

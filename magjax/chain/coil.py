@@ -8,7 +8,6 @@ Left out: the skin effect (field_diffusion), domain-wall excess loss (excess_los
 import equinox as eqx
 from jaxtyping import Array, Float
 
-
 from ..param import param
 
 

@@ -1,6 +1,5 @@
 """coil: domain-wall excess loss, an opposing field k sign(dB/dt) sqrt|dB/dt|."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..param import param

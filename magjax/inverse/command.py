@@ -8,7 +8,6 @@ import numpy as np
 from ..errors import ConfigurationError, RecordingError
 from .dynamic import KNOWN_INVERSES, SENSOR_INVERSES, PlainActuator, current_for_displacement, nearest_feasible, undo_sensor
 
-
 LONGEST_M = 5e-3  # no actuator of this kind moves further: the unit is wrong
 
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..errors import ConfigurationError
 
-
 ROUNDING = 2e-15  # of the summed masses: what the sums of the Everett table leave
 
 
