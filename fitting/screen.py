@@ -32,6 +32,8 @@ SHAPE_GRIDS = {
     "rate_dependent_switching": {"rate0": (1e3, 3e4, 1e6), "of_flux": (0.05, 0.9)},
     "second_mode": {"f2": (150.0, 250.0, 400.0, 650.0, 900.0, 1300.0, 2000.0, 3000.0), "xi2": (0.02, 0.1)},
     "structural_damping": {"dispersion": (0.0, 1.0)},
+    "strain_hysteresis": {"width": (0.03, 0.1)},
+    "delta_e": {"static": (0.05, 0.9)},
     "creep": {"shortest": (1e-4, 1e-2)},
     "coulomb_friction": {"v_s": (1e-5, 1e-3), "presliding": (1e-8, 1e-7, 1e-6)},
     "sensor_lag": {"order2": (0.0, 0.5)},

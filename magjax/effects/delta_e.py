@@ -8,13 +8,15 @@ from .forces import with_force
 
 
 class DeltaE(AbstractEffect):
-    """Relative stiffness 1 + e (m^2 - mean m^2): the resonance moves with M."""
+    """Relative stiffness 1 + e m^2: the resonance moves with M, and, `static`, the settled displacement under its force too."""
 
     e: Float[Array, ""] = param(0.0, "1", "relative change of stiffness from m = 0 to saturation", scale=0.1, null=0.0, typical=(-0.5, 1.0))
 
+    static: Float[Array, ""] = param(0.0, "1", "0: the free strain is not changed, 1: the rod gives way under a force of magnetostriction", low=0.0, high=1.0, scale=0.5, shape=True, typical=(0.0, 1.0))
+
     name = "delta_e"
     block = "mechanics"
-    law = "w0^2 -> w0^2 (1 + e m^2) on the dynamic part of y"
+    law = "y'' + 2 xi w0 y' + w0^2 (y + e m^2 (y - (1 - static) u)) = w0^2 u"
     source = "A. E. Clark, H. T. Savage, IEEE Trans. Sonics Ultrason. 22 (1975) 50 (giant Delta-E of Terfenol)"
     signature = "phase and gain near the resonance change with bias; rate-dependent distortion"
     amplitude = "e"
@@ -22,4 +24,4 @@ class DeltaE(AbstractEffect):
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with a stiffness that follows m^2, m."""
         square = (signals["magnetization"] / actuator.magnetostriction.M_s) ** 2
-        return with_force(displacement, lambda y: -self.e * square * (y - free_displacement), line, actuator)
+        return with_force(displacement, lambda y: -self.e * square * (y - (1 - self.static) * free_displacement), line, actuator)
