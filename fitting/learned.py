@@ -89,7 +89,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
         problem, z = build_problem(base.spectra, actuator, bench, names, base.choices, start[: n + 1])
         z[len(z) - problem.layout.memories :] = start[len(start) - problem.layout.memories :]
         if again:
-            z[n + 1 : n + 1 + len(names)] = moved
+            z[n + 1 : n + 1 + len(names)] = moved  # noqa: F821
         solution = solve(
             problem, z, weights, max_jacobians=base.choices.max_jacobians,
             progress=lambda k, c: say(f"learning {' and '.join(place.variables)} at the {place.block}", k, c),
@@ -264,7 +264,8 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None):
         f"recordings left out {learned.left_out[0]:.3g} -> {learned.left_out[1]:.3g})."
     )
     if learned.rivals:
-        text += f" Not told from it: {'; '.join(f'{p.block} ({" and ".join(words(v) for v in p.variables)})' for p in learned.rivals)}."
+        rivals = [f"{p.block} ({' and '.join(words(v) for v in p.variables)})" for p in learned.rivals]
+        text += f" Not told from it: {'; '.join(rivals)}."
     better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
     text += f" On check recordings: {better}." if better else ""
     text += " Beyond the range seen its interval widens."
