@@ -13,7 +13,7 @@ from fitting.density import cell_basis, hat_basis
 from fitting.fit import fit
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
-from fitting.spectra import estimate_noise, fit_lines, reduce_recording
+from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import operator_rows, unfold
 from magjax.bench import load_bench
 from magjax.errors import RecordingError
@@ -144,6 +144,22 @@ def test_noise_is_found_between_the_harmonics():
         y = 1e-5 * drive**3 + 30e-9 * rng.standard_normal(n)
         spectra.append(reduce_recording(Recording(t, {"current": drive, "displacement": y}, name=str(f)), "current", "displacement"))
     assert estimate_noise(spectra).rms == pytest.approx(30e-9, rel=0.05)
+
+
+@pytest.mark.parametrize("levels", [(30e-9, 60e-9), (30e-9, 33e-9)])
+def test_noise_is_each_recordings_own_where_it_differs_and_pooled_where_not(levels):
+    rng = np.random.default_rng(4)
+    spectra = []
+    for k in range(6):
+        t = np.arange(500) / (500 * (k + 1))
+        drive = np.sin(2 * np.pi * (k + 1) * t)
+        y = 1e-5 * drive**3 + levels[k % 2] * rng.standard_normal(500)
+        spectra.append(reduce_recording(Recording(t, {"current": drive, "displacement": y}, name=str(k)), "current", "displacement"))
+    found = [s.noise.rms for s in with_noise(spectra)]
+    if levels[1] > 1.5 * levels[0]:
+        assert np.allclose(found, np.tile(levels, 3), rtol=0.2)
+    else:
+        assert len(set(found)) == 1
 
 
 def test_unfold_finds_the_sign_of_M():
