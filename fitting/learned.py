@@ -191,17 +191,16 @@ def prediction_interval(learned: Learned, drive, dt: float, periods: int = 3, co
 
 
 def region(learned: Learned):
-    """The stretch of the first variable that holds most of the function's bending: (low, high, share of the range)."""
+    """The stretch of the first variable where the function bends: (low, high, share of the range) of 80 % of its squared
+    curvature. A constant and a slope are what the base can take up; where the function bends is what it cannot."""
     term = learned.term
     first = np.linspace(float(term.low[0]), float(term.high[0]), 201)
-    others = [np.full_like(first, 0.5 * float(a + b)) for a, b in zip(term.low[1:], term.high[1:], strict=True)]
-    if len(others) and term.variables[1].endswith("_rate") is False:
-        others = [np.full_like(first, float(b)) for b in term.high[1:]]
-    value = band(learned, first, *others)[0]
-    slope = np.gradient(value)
-    power = (slope - np.median(slope)) ** 2
-    total, best = np.cumsum(power) / max(power.sum(), 1e-300), (0, 200)
-    total = np.concatenate([[0.0], total])
+    levels = [[]] if len(term.variables) == 1 else [[float(term.low[1] + s * (term.high[1] - term.low[1]))] for s in (0.1, 0.5, 0.9)]
+    bend = [np.gradient(np.gradient(band(learned, first, *(np.full_like(first, v) for v in level))[0])) for level in levels]
+    power = np.sum(np.square(bend), axis=0)
+    power[:6] = power[-6:] = 0.0  # the ends are the least known
+    total = np.concatenate([[0.0], np.cumsum(power) / max(power.sum(), 1e-300)])
+    best = (0, 200)
     for i in range(201):
         j = int(np.searchsorted(total, total[i] + 0.8))
         if j <= 201 and j - i < best[1] - best[0]:

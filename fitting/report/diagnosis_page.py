@@ -4,7 +4,7 @@ import json
 import math
 
 from . import found as pictures
-from . import loops, misfit, plane, tables
+from . import learned, loops, misfit, plane, tables
 from .fit_page import convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
 from .style import percent, plain, scale_of, unit_text
@@ -33,7 +33,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     sections = [
         _named(found, facts),
         _groups(found, facts),
-        _unknown(found),
+        _unknown(found, sketch),
         section("Next experiment", *_next(found)),
         section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"))),
         _checks(found, evidence, sketch, output, drive),
@@ -128,18 +128,21 @@ def _groups(found, facts):
     )
 
 
-def _unknown(found):
+def _unknown(found, sketch):
     unknown = found["unknown"]
     if not unknown:
         return None
     rows = [["block it acts most like", unknown.get("block", "")], ["region", unknown.get("region", "")]]
     if "explained_share" in unknown:
         rows.append(["share of the excess that the nearest effect explains", percent(unknown["explained_share"])])
-    more = {
-        k: v for k, v in unknown.items() if k not in ("block", "region", "explained_share") and isinstance(v, (str, int, float))
-    }
-    rows += [[words(k), _shown(v)] for k, v in more.items()]
-    return section("What is known of it", part(table=tables.table("The unknown", ["question", "answer"], rows)))
+    more = {} if "function" in unknown else unknown
+    rows += [
+        [words(k), _shown(v)]
+        for k, v in more.items()
+        if k not in ("block", "region", "explained_share") and isinstance(v, (str, int, float))
+    ]
+    known = part(table=tables.table("The unknown", ["question", "answer"], rows))
+    return section("What is known of it", known, *learned.parts(unknown, sketch))
 
 
 def _next(found):

@@ -38,6 +38,8 @@ def parameters(fit, doubt: str = "", caption: str = "Fitted parameters") -> list
     """Two tables: fitted parameters with errors and flags, and those held fixed; `doubt`: a key of DOUBTS."""
     free, fixed = [], []
     for name, p in fit["parameters"].items():
+        if name.startswith("effects.learned_term."):  # its function is drawn
+            continue
         if not p["free"]:
             fixed.append([name, p.get("meaning", ""), plain(p["value"], 6), unit_text(p["unit"])])
             continue
@@ -74,7 +76,7 @@ def parameters(fit, doubt: str = "", caption: str = "Fitted parameters") -> list
 def correlations(fit) -> dict | None:
     """The correlation matrix of the fitted constants, those beyond 0.9 marked; None with less than two constants."""
     pairs = fit["correlations"]
-    names = list(dict.fromkeys(n for pair in pairs for n in pair.split("~")))
+    names = [n for n in dict.fromkeys(n for pair in pairs for n in pair.split("~")) if not n.startswith("effects.learned_term.")]
     if len(names) < 2:
         return None
     rows = []

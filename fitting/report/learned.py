@@ -1,0 +1,82 @@
+"""The learned function of an `unknown_at`: its picture with its band, what it is worth, and the boundaries that were compared."""
+
+import numpy as np
+
+from . import tables
+from .page import part
+from .style import BLUE, GREEN, MUTED, PALE, VERMILION, canvas, percent, picture, plain, styled, unit_text
+
+SHOWN = 8  # boundaries of the table
+FINE = {"m": (1e9, "nm"), "A/m": (1.0, "A/m"), "A": (1e3, "mA"), "T": (1e3, "mT")}
+
+
+def parts(unknown, sketch) -> list:
+    """Parts of the page about the learned function, none where there is none."""
+    if "function" not in unknown:
+        return []
+    before, after = unknown["left_out"]
+    rows = [
+        ["function of", " and ".join(v.replace("_", " ") for v in unknown["variables"])],
+        ["share of the excess that it takes", percent(unknown["share"])],
+        ["χ²/N of recordings left out one at a time", f"{plain(before)} → {plain(after)}"],
+        ["rms over the range seen", _with_unit(unknown["rms"], unknown["unit"])],
+        ["bends over", f"{percent(unknown['bends_over'])} of the range"],
+    ]
+    text = (
+        "It was fitted jointly with the density and all constants, held by the prior of a smooth random function, and is in the model of this "
+        "folder as learned_term. It models what is missing; it does not say what it is. Beyond the range seen it stays as at its edge, and its "
+        "interval widens."
+    )
+    return [part(text=text, table=tables.table("The learned function", ["question", "answer"], rows)), sketch(unknown["function"], learned_function, unknown), _boundaries(unknown)]
+
+
+def _with_unit(value, unit):
+    factor, label = FINE.get(unit, (1.0, unit))
+    return f"{plain(factor * value)} {label}"
+
+
+def _boundaries(unknown):
+    rivals = {(r["block"], tuple(r["variables"])) for r in unknown["rivals"]}
+    rows = []
+    for b in unknown["boundaries"][:SHOWN]:
+        place = (b["block"], tuple(b["variables"]))
+        kept = place == (unknown["block"], tuple(unknown["variables"]))
+        said = "kept" if kept else "not told from it" if place in rivals else ""
+        rows.append([b["block"], " and ".join(v.replace("_", " ") for v in b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"]), said])
+    note = (
+        "To first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit is with a smooth function there than "
+        "without. Visible: the part of it that density and constants cannot make."
+    )
+    head = ["block", "function of", "evidence", "share explained", "visible", ""]
+    return part(table=tables.table("Where a smooth function would serve", head, rows, note))
+
+
+def learned_function(unknown, stem: str = "learned"):
+    """The function with its 95 % band over its first variable; the range seen is white, beyond it grey."""
+    x = np.asarray(unknown["function"]["x"])
+    unit = unknown["variable_units"][0]
+    fine = {"m": (1e6, "µm"), "m/s": (1e3, "mm/s"), "A/m": (1e-3, "kA/m")}
+    factor, label = fine.get(unit, (1.0, unit_text(unit)))
+    scale, output = FINE.get(unknown["unit"], (1.0, unknown["unit"]))
+    seen = [factor * v for v in unknown["seen"][0]]
+    second = unknown["variables"][1].replace("_", " ") if len(unknown["variables"]) > 1 else ""
+    with styled():
+        figure = canvas(10.0, 2.8)
+        axes = figure.add_axes([0.085, 0.19, 0.86, 0.76])
+        for s, colour, dash in zip(unknown["function"]["slices"], (BLUE, VERMILION, GREEN), ("-", (0, (5, 2)), (0, (1, 1))), strict=False):
+            name = "learned" if s["at"] is None else f"{second} {plain(s['at'])} {unit_text(unknown['variable_units'][1])}"
+            axes.fill_between(factor * x, scale * np.asarray(s["low"]), scale * np.asarray(s["high"]), color=colour, alpha=0.18, lw=0)
+            axes.plot(factor * x, scale * np.asarray(s["value"]), color=colour, ls=dash, label=name)
+        for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
+            axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
+        axes.axhline(0, color=MUTED, lw=0.5)
+        axes.set(xlim=(factor * x[0], factor * x[-1]), xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}")
+        if len(unknown["function"]["slices"]) > 1:
+            axes.legend(loc="best")
+        caption = (
+            f"Learned function: what the {unknown['block']} adds beside the model, with its 95 % interval, less its mean. Grey: beyond what the recordings "
+            "reached, where it is held and its interval widens."
+        )
+        middle = unknown["function"]["slices"][0]
+        words = f"From {plain(scale * middle['value'][0])} to {plain(scale * middle['value'][-1])} {output}."
+        return picture(figure, stem, "Learned function", caption, words)

@@ -1,0 +1,183 @@
+"""The learned term: an effect like any other, found by evidence, known only as far as recordings tell."""
+
+import dataclasses
+import types
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fitting.learned as learned_module
+from fitting.demo import concealed_actuator, record
+from fitting.learned import Learned, band, described, left_out, prediction_interval, region, with_learned_term
+from fitting.nonparametric import Place, evidence, prior_deviations
+from fitting.result import write_model
+from magjax.bench import load_bench
+from magjax.effects import CATALOGUE, AbstractEffect
+from magjax.effects.learned_term import OUTPUTS, PLACES, LearnedTerm
+from magjax.model_file import load_model
+from magjax.simulate import run_chain, simulate
+from tests.test_simulate import actuator, sine
+
+N = 160
+CURRENT = jnp.asarray(sine(N, 0.7))
+DT = 1 / (80 * N)
+RANGES = {
+    "current": (-0.8, 0.8), "current_rate": (-300, 300), "field": (0, 25e3), "magnetization": (-6e5, 6e5), "flux_rate": (-200, 200),
+    "displacement": (0, 5e-5), "displacement_rate": (-0.02, 0.02), "reading": (0, 5e-5), "reading_rate": (-0.02, 0.02),
+}  # fmt: skip
+SIZES = {"A": 1e-3, "A/m": 10.0, "m": 1e-8, "reading": 1e-8}
+
+
+def term_at(place, counts=(4, 3)):
+    names = PLACES[place][:2]
+    low, high = zip(*(RANGES[n] for n in names), strict=True)
+    knee = [0.1 * RANGES[n][1] if n.endswith("rate") else 0.0 for n in names]
+    return LearnedTerm.null(place, names, low, high, counts, np.ones(int(np.prod(counts))), SIZES[OUTPUTS[place]], knee)
+
+
+@eqx.filter_jit
+def reading(act, current=CURRENT):
+    return run_chain(act, current, DT, 2, 4, "trapezoid").reading
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_null_gradient_and_batch(place):
+    act = actuator(20)
+    extended = act.with_effect(term_at(place))
+    base = np.asarray(reading(act))
+    assert np.abs(np.asarray(reading(extended)) - base).max() <= 2e-15 * np.abs(base).max()
+
+    def at(value):
+        return reading(extended.replace({"effects.learned_term.c1": value, "effects.learned_term.c7": 0.5 * value}))
+
+    exact = np.asarray(eqx.filter_jit(lambda v: jax.jvp(at, (v,), (jnp.ones_like(v),))[1])(jnp.asarray(0.3)))
+    number = (np.asarray(at(0.301)) - np.asarray(at(0.299))) / 2e-3
+    assert np.abs(number).max() > 0
+    assert np.abs(exact - number).max() < 2e-4 * np.abs(number).max()
+    one = extended.replace({"effects.learned_term.c1": 0.3})
+    both = jax.vmap(lambda c: reading(one, c))(jnp.stack([CURRENT, 0.5 * CURRENT]))
+    assert np.asarray(both[1]) == pytest.approx(np.asarray(reading(one, 0.5 * CURRENT)), abs=1e-16, rel=1e-9)
+
+
+def test_it_is_not_screened():
+    assert LearnedTerm not in CATALOGUE and LearnedTerm.name not in {k.name for k in CATALOGUE}
+
+
+def test_its_model_is_read_again_bit_for_bit(tmp_path):
+    bench = load_bench("aa-050h")
+    act = bench.actuator().with_effect(term_at("sensor")).replace({f"effects.learned_term.c{k}": 0.1 * k for k in range(12)})
+    write_model(tmp_path, act, bench)
+    again, _ = load_model(tmp_path)
+    assert np.array_equal(np.asarray(simulate(act, CURRENT, DT, periodic=True).reading), np.asarray(simulate(again, CURRENT, DT, periodic=True).reading))
+
+
+def test_the_function_stays_as_at_its_edge_beyond_the_range():
+    term = term_at("sensor").null("sensor", ("reading",), [0.0], [1.0], (5,), np.ones(5), 2.0, coefficients=[0.3, -1, 0.5, 0.2, 0.7])
+    assert float(term.value(jnp.asarray(1.4))) == float(term.value(jnp.asarray(1.0))) != float(term.value(jnp.asarray(0.9)))
+    tilted = dataclasses.replace(term, beyond=jnp.asarray([0.0, 1.0]))
+    assert float(tilted.value(jnp.asarray(1.4)) - term.value(jnp.asarray(1.4))) == pytest.approx(2.0 * 0.4)
+
+
+def test_evidence_knows_a_function_from_noise():
+    rng = np.random.default_rng(0)
+    s = rng.uniform(0, 1, 600)
+    term = LearnedTerm.null("sensor", ("reading",), [0.0], [1.0], (48,), np.ones(48), 1.0)
+    columns = np.asarray(term.basis(s, xp=np)[0]).T
+    noise = rng.standard_normal(600)
+    found = evidence(columns, noise - 3 * np.tanh((s - 0.6) / 0.05), (48,), 600)
+    assert found[0] > 500 and found[1] > 0.8 and 0.03 <= found[2] <= 0.25
+    assert evidence(columns, noise, (48,), 600)[0] < 3
+    assert np.sum(prior_deviations((48,), 0.1) ** 2 * np.append(1.0, np.full(47, 0.5))) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_left_out_is_what_a_fit_without_the_recording_foretells(monkeypatch):
+    rng = np.random.default_rng(1)
+    R, H, n = 3, 5, 4
+    A, b, P = rng.standard_normal((R * (2 * H - 1), n)), rng.standard_normal(R * (2 * H - 1)), np.diag([0.1, 0.2, 0.3, 0.4])
+    z = np.linalg.solve(A.T @ A + P, A.T @ b)
+    monkeypatch.setattr(learned_module, "data_jacobian", lambda p, y: A)
+    monkeypatch.setattr(learned_module, "data_residual", lambda p, y: A @ y - b)
+    monkeypatch.setattr(learned_module, "prior_matrix", lambda p, w: P)
+    target = types.SimpleNamespace(lines=np.zeros((R, H)), deviations=np.ones((R, H)))
+    problem = types.SimpleNamespace(layout=types.SimpleNamespace(density_unknowns=0), target=target)
+    found = left_out(problem, types.SimpleNamespace(z=z, weights=None))
+    owner = np.concatenate([np.repeat(np.arange(R), H), np.repeat(np.arange(R), H - 1)])
+    for k in range(R):
+        kept, mine = owner != k, owner == k
+        other = np.linalg.solve(A[kept].T @ A[kept] + P, A[kept].T @ b[kept])
+        assert found[k] == pytest.approx(np.sum((A[mine] @ other - b[mine]) ** 2) / (2 * H - 1), rel=1e-6)
+
+
+def test_the_band_widens_beyond_what_was_seen():
+    deviation = prior_deviations((16,), 0.2)
+    values = 0.5 * deviation * np.cos(np.arange(16))
+    term = LearnedTerm.null("magnetostriction", ("field",), [0.0], [2e4], (16,), deviation, 1e-7, coefficients=values)
+    place = Place("magnetostriction", ("field",), 100.0, 0.9, 0.2, 1e-7, 0.1, term)
+    learned = Learned(place, term, None, np.diag((0.02 * deviation) ** 2), (5.0, 1.1), 0.9)
+    deviations = band(learned, np.array([1e4, 2e4, 2.1e4, 2.4e4]))[1]
+    assert deviations[0] < 0.05e-7 and deviations[1] < deviations[2] < deviations[3]
+    assert deviations[3] == pytest.approx(1e-7 * 0.2 / 0.2, rel=0.05)
+    assert learned.worth and not dataclasses.replace(learned, left_out=(5.0, 4.9)).worth
+    low, high, share = region(learned)
+    assert 0 <= low < high <= 2e4 and 0 < share <= 1
+    learned = dataclasses.replace(learned, result=types.SimpleNamespace(recordings=[types.SimpleNamespace(unit="m")]))
+    content = described(learned)
+    assert content["seen"] == [[0.0, 2e4]] and len(content["function"]["x"]) == len(content["function"]["slices"][0]["low"])
+
+
+class FieldKink(AbstractEffect):
+    """A step of the strain at one field: in no catalogue."""
+
+    name = "field_kink"
+    block = "magnetostriction"
+
+    def strain(self, free_displacement, magnetization, field, line, actuator):
+        """Free displacement with the step, m."""
+        return free_displacement + 4e-7 * jnp.tanh((field - 1.5e4) / 500.0)
+
+    @classmethod
+    def parameters(cls):
+        return {}
+
+
+@pytest.mark.long
+def test_an_effect_outside_the_catalogue_is_placed_and_modelled(tmp_path):
+    from fitting.diagnose import diagnose
+    from fitting.report import write_diagnosis
+
+    bench = load_bench("aa-050h")
+    truth = concealed_actuator(bench, FieldKink())
+    rng = np.random.default_rng(3)
+    drives = ((10, 0.8, 0.1), (25, 0.5, 0.1), (50, 0.8, 0.1), (120, 0.5, 0.1), (200, 0.8, 0.1), (300, 0.5, 0.1))
+    runs = [record(truth, *d, rng, f"r{d[0]}") for d in drives]
+    checks = [record(truth, 80, 0.7, 0.1, rng, "c80")]
+    found = diagnose(runs, bench, check=checks)
+    assert found.verdict == "unknown_at"
+    assert found.unknown["block"] == "magnetostriction" and found.unknown["variables"] == ["field"]
+    assert found.unknown["share"] > 0.9
+    (row,) = found.check
+    assert row["rms_after"] < 1.3 * row["noise_rms"] < row["rms_before"]
+    write_diagnosis(tmp_path, found, runs, found.as_dict(), "magjax diagnose", checks)
+    again, _ = load_model(tmp_path)
+    assert [e.name for e in again.effects] == ["learned_term"]
+    assert "Learned function" in (tmp_path / "report.html").read_text()
+    content = with_learned_term(found, found.base, runs, bench).unknown
+    assert content["block"] == "magnetostriction"
+
+
+@pytest.mark.long
+def test_the_prediction_is_less_sure_beyond_what_was_seen():
+    bench = load_bench("aa-050h")
+    act = concealed_actuator(bench, None)
+    deviation = prior_deviations((12,), 0.2)
+    term = LearnedTerm.null("magnetostriction", ("field",), [5e3], [1.9e4], (12,), deviation, 1e-7)
+    place = Place("magnetostriction", ("field",), 100.0, 0.9, 0.2, 1e-7, 0.1, term)
+    result = types.SimpleNamespace(actuator=act.with_effect(term))
+    learned = Learned(place, term, result, np.diag((0.01 * deviation) ** 2), (5.0, 1.1), 0.9)
+    phase = 2 * np.pi * np.arange(250) / 250
+    inside = prediction_interval(learned, 0.3 * np.sin(phase), 1 / 2500)[1]
+    beyond = prediction_interval(learned, 0.8 * np.sin(phase), 1 / 2500)[1]
+    assert beyond.max() > 5 * inside.max() > 0
