@@ -60,8 +60,11 @@ def leaders(candidates, count: int = LEADERS):
     return chosen
 
 
-def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None, warm: bool = False) -> Trial:
-    """Fit base + effect from scratch, started at the screening's amplitude; `warm`: from the density of the base."""
+def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None, warm: bool = False, target: float = np.inf) -> Trial:
+    """Fit base + effect from scratch, started at the screening's amplitude; `warm`: from the density of the base.
+
+    `target`: a chi2 that it must come near to be of use.
+    """
     info = effect_class.parameters()[effect_class.amplitude]
     reach = max(abs(t) for t in info.typical) if info.typical else 10 * info.scale
     amplitude = float(np.clip(candidate.amplitude, -reach, reach))
@@ -70,7 +73,7 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     held = tuple(f"effects.{e.name}.{p}" for e in base.actuator.effects for p in e.parameters())
     start = base.solution.z[: base.problem.layout.density_unknowns + 1] if warm and choices.knots == base.choices.knots else None
     actuator = base.actuator.with_effect(effect)
-    result = fit(recordings, bench, actuator=actuator, extra=(*held, *names), choices=choices, refine=False, progress=progress, start=start)
+    result = fit(recordings, bench, actuator=actuator, extra=(*held, *names), choices=choices, refine=False, progress=progress, start=start, target=target)
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
     drop = chi2_of(base) - chi2_of(result)

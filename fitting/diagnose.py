@@ -6,12 +6,13 @@ catalogue off the full tangent space, real fits of the leaders, groups, checks, 
 
 import dataclasses
 
+import jax
 import numpy as np
 
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 
-from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, STRUCTURES, TIE, chi2_of, confidence, leaders, rivals_of, try_effect
+from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, STRUCTURES, TIE, WEAK_TIE, chi2_of, confidence, leaders, rivals_of, try_effect
 from .check import check_errors
 from .experiments import instrument_request, next_experiment
 from .fit import REFINE_BETWEEN, REST_SETTLED, fit
@@ -190,7 +191,8 @@ def _search(recordings, bench, base, candidates, choices, progress, check=()) ->
             if settled and c.name not in STRUCTURES and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
                 continue
             say(f"trying {c.name}", 0, state.current.chi2_per_sample)
-            trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress, bool(state.steps))
+            reached = min((chi2_of(t.result) for t in trials if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
+            trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress, bool(state.steps), reached)
             trials.append(trial)
             state.tried[c.name] = trial.candidate
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
@@ -205,6 +207,7 @@ def _search(recordings, bench, base, candidates, choices, progress, check=()) ->
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
         candidates = _screen(best.result, choices)
+        jax.clear_caches()  # programs of trials that are not needed again
     _backward(recordings, bench, state, chosen, count, progress)
     state.unexplained = max(chi2_of(state.current) - count, 0.0)
     return state

@@ -22,12 +22,13 @@ REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
-def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None) -> FitResult:
+def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None, target: float = np.inf) -> FitResult:
     """Fit an actuator to recordings jointly.
 
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
     of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it; `progress`:
-    called as progress(text, step, chi2 per datum). Returns a `FitResult`; raises `RecordingError` where a recording
+    called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early.
+    Returns a `FitResult`; raises `RecordingError` where a recording
     cannot be used and `ConfigurationError` for a wrong bench. Non-convergence is a result, not an exception.
     """
     require_x64()
@@ -46,7 +47,7 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), start)
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
-    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report)
+    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
     if refine and choices.knots is not None:
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report)
     return dataclasses.replace(finish(problem, solution, choices, bench, recordings, warm), history=tuple(history))
@@ -62,7 +63,7 @@ def _rests(bench, choices):
     return (RESTS[bench.start],) if bench.start in RESTS else ("negative", "demagnetized", "positive")
 
 
-def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report):
+def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):
     """The fit from each start memory until one meets the noise; the best of them."""
     best = None
     for rest in _rests(bench, choices):
@@ -70,7 +71,9 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
         if best is not None:
             problem, z = build_problem(spectra, actuator, bench, names, tried, start)
         weights = START_WEIGHTS[: len(problem.layout.penalties)]
-        solution = solve(problem, z, weights, max_jacobians=choices.max_jacobians, progress=lambda k, c: report("fit", k, c))
+        solution = solve(
+            problem, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: report("fit", k, c)
+        )  # fmt: skip
         levels = solution.z[len(solution.z) - problem.layout.memories :]
         score = solution.chi2 + float(levels @ levels)
         if best is None or score < best[3]:

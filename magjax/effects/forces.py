@@ -1,5 +1,7 @@
 """Helper for effects of the mechanics that add a force: the displacement that bears it, by a damped fixed point."""
 
+import jax
+
 
 def with_force(displacement, force, line, actuator, rounds: int = 6, stiffness=0.0):
     """The displacement that solves y = y_linear + G[force(y)], `force` in metres of equivalent free displacement.
@@ -8,8 +10,9 @@ def with_force(displacement, force, line, actuator, rounds: int = 6, stiffness=0
     that hardens by s in places, `stiffness` = s/2 (relative to the rod's) keeps it so: each correction is that of a rod with
     this much more stiffness.
     """
-    y = displacement
-    for _ in range(rounds):
+
+    def correct(y, _):
         left = y - displacement - line.filter(force(y), actuator.mechanics.response)
-        y = y - left - line.filter(left, lambda s: 1 / (1 + stiffness * actuator.mechanics.response(s)) - 1)
-    return y
+        return y - left - line.filter(left, lambda s: 1 / (1 + stiffness * actuator.mechanics.response(s)) - 1), None
+
+    return jax.lax.scan(correct, displacement, length=rounds)[0]
