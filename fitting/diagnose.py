@@ -27,7 +27,7 @@ from .setup import Choices, spectra_of
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 Z_THRESHOLD = 5.5  # about forty columns are looked at
 RECORD_Z = 8.0
-FULL_SHARE = 0.93
+FULL_SHARE = 0.96
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 MAX_EFFECTS = 3
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
