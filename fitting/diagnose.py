@@ -12,6 +12,7 @@ import numpy as np
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 
+from .alternation import alternating
 from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, STRUCTURES, TIE, WEAK_TIE, chi2_of, confidence, leaders, rivals_of, try_effect
 from .check import check_errors
 from .experiments import instrument_request, next_experiment
@@ -92,6 +93,9 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     held = tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
     spectra = spectra_of(recordings, bench, choices.harmonics)
     say("between the harmonics", 0, None)
+    if alternation := alternating(recordings, spectra, bench.output):
+        rest = diagnose(alternation.cleaned, bench, check=check, actuator=actuator, choices=choices, progress=progress, placebo_runs=placebo_runs)
+        return alternation.told(rest)
     problem = data_problem(recordings, spectra, bench.output)
     if problem:
         base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress, refine=False)

@@ -17,7 +17,7 @@ from magjax.simulate import run_chain
 from .check import check_errors
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
-from .nonparametric import Place, locate_places
+from .nonparametric import ONE, Place, locate_places
 from .setup import build_problem
 from .uncertainty import WIDEN, covariance
 
@@ -84,14 +84,15 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
     names = (*base.problem.layout.names, *(f"effects.learned_term.{c}" for c in place.term.parameters()))
     term, start, weights, z = place.term, base.solution.z, base.solution.weights, None
     before = base.chi2_per_sample * base.data_count
+    choices = dataclasses.replace(base.choices, coarse=base.choices.fine) if max(term.counts) > ONE else base.choices
     for again in range(2):
         actuator = base.actuator.with_effect(term)
-        problem, z = build_problem(base.spectra, actuator, bench, names, base.choices, start[: n + 1])
+        problem, z = build_problem(base.spectra, actuator, bench, names, choices, start[: n + 1])
         z[len(z) - problem.layout.memories :] = start[len(start) - problem.layout.memories :]
         if again:
             z[n + 1 : n + 1 + len(names)] = moved  # noqa: F821
         solution = solve(
-            problem, z, weights, max_jacobians=base.choices.max_jacobians,
+            problem, z, weights, max_jacobians=choices.max_jacobians,
             progress=lambda k, c: say(f"learning {' and '.join(place.variables)} at the {place.block}", k, c),
         )  # fmt: skip
         first = problem.layout.index(names[len(base.problem.layout.names)])
@@ -112,7 +113,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
         kept = {name: float(problem.layout.value(name, jnp.asarray(start))) for name in base.problem.layout.names}
         moved[: len(kept)] = 0.0
         base = dataclasses.replace(base, actuator=base.actuator.replace(kept))
-    result = finish(problem, solution, base.choices, bench, recordings)
+    result = finish(problem, solution, choices, bench, recordings)
     fitted = result.actuator.effect("learned_term")
     after = result.chi2_per_sample * result.data_count
     share = (before - after) / max(before - result.data_count, 1e-9)

@@ -19,14 +19,14 @@ from magjax.effects.base import AbstractEffect
 from magjax.effects.learned_term import PAD, LearnedTerm
 from magjax.simulate import finish_chain, run_chain
 
-from .screen import Projector, _march_columns, _steady_state, _trajectory, changed_drive
 from .model import whitened
+from .screen import Projector, _march_columns, _trajectory, changed_drive
 
 ONE = 48  # cosines of a function of one variable
 FINE = 160  # where none of these serves: of one variable of the sensor or the strain
 TWO = (10, 7)
 IN_STEP = (10, 6)  # inside the step every cosine costs in every iteration
-LENGTHS = (0.5, 0.25, 0.12, 0.06, 0.03, 0.015)  # of the range, over which a function bends
+LENGTHS = (0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.008)  # of the range, over which a function bends
 FINER_GAIN = 5.0  # of evidence, that more cosines must bring
 KNEE = 0.1  # of the largest rate, below which a rate counts linearly
 
@@ -66,7 +66,7 @@ def _signals(predictor, actuator):
     def one(drive, dt):
         s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners)
         line = Timeline(dt, drive.shape[0], True)
-        found = {"current": s.current, "field": s.relay_field, "magnetization": s.magnetization, "reading": s.reading}
+        found = {"current": s.current, "field": s.relay_field, "coil_field": s.field, "magnetization": s.magnetization, "reading": s.reading}
         if s.displacement is not None:
             found |= {"displacement": s.displacement, "stretch": s.displacement - s.free_displacement}
         rates = {f"{n}_rate": line.derivative(found[n]) for n in ("current", "field", "magnetization", "displacement", "reading") if n in found}
@@ -152,9 +152,10 @@ class Tangents:
         self.actuator = self.problem.layout.actuator(self.problem.template, jnp.asarray(self.solution.z))
         self.predictor = self.problem.predictors[0]
         self.projector = Projector(self.problem, self.solution)
-        self.last = _signals(self.predictor, self.actuator)
+        self.fine = self.problem.predictors[1]  # a sharp function needs its samples
+        self.last = _signals(self.fine, self.actuator)
         self.signals = {n: np.concatenate([np.asarray(g[n]).ravel() for g in self.last]) for n in self.last[0]}
-        self.states = _steady_state(self.predictor, self.actuator)
+        self.states = [(g["coil_field"], g["magnetization"]) for g in self.last]
         self.trajectory = _trajectory(self.predictor, self.actuator)
         self.marched = [_step_signals(self.actuator.coil.scheme, *(np.asarray(x) for x in part)) for part in self.trajectory]
         self.zero = eqx.tree_at(lambda t: t.lines, self.problem.target, jnp.zeros_like(self.problem.target.lines))
@@ -172,13 +173,14 @@ class Tangents:
         else:
             waves = tuple(float(term.size) * self._waves(term, g) for g in self.last)
             if term.place == "source":
+                waves = tuple(w[:, :, :: w.shape[2] // d.shape[1]] for w, d in zip(waves, p.drives, strict=True))
                 shapes = [(len(w), *np.shape(part[0])) for w, part in zip(waves, self.trajectory, strict=True)]
                 rows = tuple(tuple(np.zeros(shape) for _ in range(3)) for shape in shapes)
                 lines = _march_columns(p, a, (rows, waves))
             else:
                 at = ("magnetostriction", "mechanics", "sensor").index(term.place)
                 given = tuple(tuple(w if k == at else np.zeros_like(w) for k in range(3)) for w in waves)
-                lines = _late_columns(p, a, self.states, given)
+                lines = _late_columns(self.fine, a, self.states, given)
         return np.stack([np.asarray(whitened(line, self.zero)) for line in lines], axis=1)
 
     def _waves(self, term, signals):

@@ -60,6 +60,9 @@ def learned_function(unknown, stem: str = "learned"):
     scale, output = FINE.get(unknown["unit"], (1.0, unknown["unit"]))
     seen = [factor * v for v in unknown["seen"][0]]
     second = unknown["variables"][1].replace("_", " ") if len(unknown["variables"]) > 1 else ""
+    inside = (x >= unknown["seen"][0][0]) & (x <= unknown["seen"][0][1])
+    ends = [scale * f([f(np.asarray(s[k])[inside]) for s in unknown["function"]["slices"]]) for k, f in (("low", np.min), ("high", np.max))]
+    room = 0.6 * (ends[1] - ends[0])
     with styled():
         figure = canvas(10.0, 2.8)
         axes = figure.add_axes([0.085, 0.19, 0.86, 0.76])
@@ -70,7 +73,7 @@ def learned_function(unknown, stem: str = "learned"):
         for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
             axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
         axes.axhline(0, color=MUTED, lw=0.5)
-        axes.set(xlim=(factor * x[0], factor * x[-1]), xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}")
+        axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room), xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}")
         if len(unknown["function"]["slices"]) > 1:
             axes.legend(loc="best")
         caption = (
