@@ -23,6 +23,8 @@ from .uncertainty import WIDEN, covariance
 
 TRIED = 3  # leaders that are fitted jointly
 NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
+MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
+CLOSE = 0.96
 SIMPLER = 0.93  # of the evidence is enough for one variable in place of two
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
@@ -140,7 +142,11 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
     places = [p for p in locate_places(base, say) if p.evidence > 0]
     if not places:
         return None
-    tried = [fit_term(base, place, recordings, bench, progress) for place in chosen_places(places)]
+    tried = []
+    for place in chosen_places(places):
+        met = [t for t in tried if t.result.chi2_per_sample < MET and place.evidence < CLOSE * t.place.evidence]
+        if not met:
+            tried.append(fit_term(base, place, recordings, bench, progress))
     tried = sorted((t for t in tried if np.isfinite(t.result.chi2_per_sample)), key=lambda t: t.left_out[1])
     if not tried or not tried[0].worth:
         return None
