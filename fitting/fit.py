@@ -136,7 +136,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
     cov = covariance(solution.normal, solution.z, problem.layout.density_unknowns)
     effective = float(np.trace(cov @ (solution.normal - prior_matrix(problem, solution.weights))))
     chi2n = solution.chi2 / count
-    message = outcome(chi2n, per_recording, solution, rows, problem)
+    message = outcome(chi2n, per_recording, solution, rows, problem) + unsettled(problem.spectra)
     return FitResult(
         fitted, bench, bool(solution.converged), message, tuple(rows), correlations(problem, refined), per_recording, float(chi2n), count,
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
@@ -167,6 +167,14 @@ def recording_fits(problem, residual, recordings, bench):
             )
         )  # fmt: skip
     return tuple(rows)
+
+
+def unsettled(spectra) -> str:
+    """What was taken out of recordings that began before the mechanics had settled, in words."""
+    starts = [float(np.abs(s.start).max()) for s in spectra if s.start is not None]
+    if not starts:
+        return ""
+    return f"; {len(starts)} of {len(spectra)} recordings began unsettled: a decaying motion of up to {max(starts):.2g} m was taken out"
 
 
 def outcome(chi2n, rows, solution, parameters, problem) -> str:

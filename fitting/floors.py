@@ -140,7 +140,7 @@ def remove_record_effect(recordings, effect, output):
 def data_problem(recordings, spectra, output) -> str | None:
     """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
     for recording, s in zip(recordings, spectra, strict=True):
-        y = np.asarray(recording.channels[output])[: s.samples]
+        y = _reading(recording, s, output)
         if s.periods >= 2:
             step = int(s.samples / s.periods)
             cycles = np.arange(s.samples) * s.dt * s.frequency  # periods need not divide the sampling
@@ -157,13 +157,19 @@ def data_problem(recordings, spectra, output) -> str | None:
             if moved > 0.05 * s.peak_to_peak and moved > 8 * floor:
                 return f"{recording.name}: the reading drifts by {moved:.3g} through the record; let it warm up, or remove the drift first"
     recording, s = min(zip(recordings, spectra, strict=True), key=lambda pair: pair[1].samples * pair[1].dt)
-    y = np.asarray(recording.channels[output])[: s.samples]
+    y = _reading(recording, s, output)
     if s.periods >= 2 and (change := _period_change(s, y)) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
         return (
             f"{recording.name}: the periods do not repeat: the last differs from the first by {change:.3g} rms within "
             f"{s.samples * s.dt * 1e3:.3g} ms, too fast for a drift; wait until the reading is settled, then record"
         )
     return None
+
+
+def _reading(recording, s, output):
+    """The samples that a spectrum was made of: the reading less a start that decays with the mechanics."""
+    y = np.asarray(recording.channels[output])[: s.samples]
+    return y if s.start is None else y - s.start
 
 
 def _period_change(s, y) -> float:

@@ -16,6 +16,7 @@ from .model import Layout, Predictor, Target, make_start_actuator
 from .solver import bounded_step
 from .spectra import HARMONICS, gain_rows, line_deviations, reduce_recording, with_noise
 from .starts import equation_error_start, scan_loss
+from .transients import unsettled_starts
 
 START_WEIGHTS = (1e2, 1e2, 1e2, 1e2)  # one a family of penalties; the last where there is a reversible part
 PLANE_MARGIN = 0.01
@@ -39,16 +40,31 @@ class Choices:
 
 
 def spectra_of(recordings, bench, harmonics: int = HARMONICS):
-    """Each recording reduced to lines; raises `RecordingError` where one is not periodic."""
-    spectra = []
+    """Each recording reduced to lines, decaying starts taken out; raises `RecordingError` where one is not periodic."""
     for recording in recordings:
         if recording.frequency() is None:
             raise RecordingError(
                 f"{recording.name}: the {recording.drive} does not repeat; a fit needs periodic drives (one whole period at least), "
                 "give this recording with --check instead"
             )
-        spectra.append(reduce_recording(recording, bench.drive, bench.output, harmonics, bench.columns))
+
+    def reduced(recording):
+        return reduce_recording(recording, bench.drive, bench.output, harmonics, bench.columns)
+
+    spectra = [reduced(r) for r in recordings]
+    if bench.output == "displacement" and "mechanics.f0" in bench.constants:
+        starts = unsettled_starts(spectra, float(bench.constants["mechanics.f0"]), float(bench.constants["mechanics.xi"]))
+        for k, start in enumerate(starts):
+            if start is not None:
+                spectra[k] = dataclasses.replace(reduced(_less(recordings[k], bench.output, start)), start=start)
     return with_noise(spectra)
+
+
+def _less(recording, output, start):
+    """The recording without a decaying start."""
+    reading = np.array(recording.channels[output], float)
+    reading[: len(start)] -= start
+    return dataclasses.replace(recording, channels={**recording.channels, output: reading})
 
 
 def applied_range(spectra, actuator):

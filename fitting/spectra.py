@@ -41,6 +41,7 @@ class Spectrum:
     systematic: np.ndarray | None = None  # what the converters leave in each reading line, deviation of its parts
     gain_accuracy: float = 0.0  # the reading's scale in this recording, relative standard deviation
     hum: tuple[tuple[float, float], ...] | None = None  # frequency, Hz, and amplitude of tones taken out where they can be told
+    start: np.ndarray | None = None  # decaying motion of an unsettled start, taken out of the reading, (samples,)
 
     @property
     def noise_rms(self) -> float:
