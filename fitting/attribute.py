@@ -12,7 +12,10 @@ import numpy as np
 from .fit import fit
 from .screen import Candidate
 
-LEADERS = 4
+LEADERS = 6  # families of directions that are tried
+FAMILY = 0.85  # |cos| of two directions that makes a family
+WORTH = 0.3  # of the highest score
+MATES = 4
 SETTLED_CHI2 = 1.12  # a leader that reaches this leaves only close rivals to try
 CLOSE = 0.8  # share of the best score that makes a close rival
 MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
@@ -44,20 +47,38 @@ def chi2_of(result) -> float:
     return result.chi2_per_sample * result.data_count
 
 
+# known rivals to first order whose score says little once the base has bent to the other: tried wherever that one is
+COMPANIONS = {"second_eddy_path": "amplifier_lag", "transport_delay": "sensor_lag"}
 STRUCTURES = ("eddy_currents",)  # their column at null says little: at their real size they change which relays switch
 
 
 def leaders(candidates, count: int = LEADERS):
-    """The candidates worth a fit: the highest scores, those of other blocks that come near the first, and structures."""
+    """The candidates worth a fit, best first: the highest score of each family of like directions, and structures.
+
+    Where much is amiss every candidate scores, and the highest ones are often rivals of one another: a family is tried by
+    its first member, and the rest of it (`family`) once that has proved the best.
+    """
     visible = [c for c in candidates if abs(c.z) > 3 and c.visibility > 1e-3]
-    chosen = visible[:count]
-    best = abs(visible[0].z) if visible else 0.0
-    for c in visible[count:]:
-        if c.block not in {x.block for x in chosen} and abs(c.z) > 0.7 * best:
+    chosen = []
+    for c in visible:
+        if len(chosen) < count and abs(c.z) > WORTH * abs(visible[0].z) and not any(_alike(c, x) > FAMILY for x in chosen):
             chosen.append(c)
     if chosen:
         chosen += [c for c in candidates if c.name in STRUCTURES and c not in chosen]
     return chosen
+
+
+def family(best: Candidate, candidates, tried) -> list[Candidate]:
+    """Candidates not `tried` (names) that look like the best to first order, or score nearly as it does."""
+    near = [c for c in candidates if c.name not in tried and abs(c.z) > 3 and c.visibility > 1e-3]
+    like = [c for c in near if _alike(c, best) > FAMILY or abs(c.z) > CLOSE * abs(best.z)]
+    return like[:MATES]
+
+
+def _alike(a: Candidate, b: Candidate) -> float:
+    if a.direction is None or b.direction is None or len(a.direction) != len(b.direction):
+        return 0.0
+    return abs(float(a.direction @ b.direction))
 
 
 def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None, warm: bool = False, target: float = np.inf) -> Trial:
@@ -101,10 +122,7 @@ def rivals_of(best: Trial, trials) -> list[Trial]:
 
 
 def _same(a: Trial, b: Trial) -> bool:
-    x, y = a.candidate.direction, b.candidate.direction
-    if x is None or y is None or len(x) != len(y):
-        return False
-    return abs(float(x @ y)) > SAME_DIRECTION
+    return _alike(a.candidate, b.candidate) > SAME_DIRECTION
 
 
 def confidence(best: Trial, trials) -> float:

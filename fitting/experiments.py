@@ -22,7 +22,7 @@ from .uncertainty import covariance
 
 SURE = 0.9
 PERIODS = 4
-SHUNT = "the coil current by a shunt, beside its command and on the same clock"
+SHUNT = "the coil's current by a shunt beside its command"
 CALIBRATION = "a calibration of the sensor (its reading of a known displacement; a mass added, which moves the rod's resonance alone, tells too)"
 INSTRUMENTS = ("source", "sensor")
 CHANNELS = {

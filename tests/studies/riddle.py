@@ -123,7 +123,7 @@ def pulls(told: dict) -> dict:
     for effect in told["effects"]:
         for k, v in true.get(effect["name"], {}).items():
             row = effect["parameters"][k]
-            found[f"{effect['name']}.{k}"] = (row["value"] - v) / row["stderr"]
+            found[f"{effect['name']}.{k}"] = float((row["value"] - v) / row["stderr"])
     return found
 
 
