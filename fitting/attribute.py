@@ -71,8 +71,9 @@ def leaders(candidates, count: int = LEADERS):
 def family(best: Candidate, candidates, tried) -> list[Candidate]:
     """Candidates not `tried` (names) that look like the best to first order, or score nearly as it does."""
     near = [c for c in candidates if c.name not in tried and abs(c.z) > 3 and c.visibility > 1e-3]
-    like = [c for c in near if _alike(c, best) > FAMILY or abs(c.z) > CLOSE * abs(best.z)]
-    return like[:MATES]
+    like = [c for c in near if _alike(c, best) > FAMILY or abs(c.z) > CLOSE * abs(best.z)][:MATES]
+    known = [c for c in candidates if c.name == COMPANIONS.get(best.name) and c.name not in tried and c not in like]
+    return known + like
 
 
 def _alike(a: Candidate, b: Candidate) -> float:
