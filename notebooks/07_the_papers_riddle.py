@@ -12,8 +12,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small dense solves: more t
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fitting import diagnose, fit
+from fitting.diagnose import diagnose
 from fitting.demo import SINES, concealed_actuator
+from fitting.fit import fit
 from fitting.instruments import known_instruments, line_gains, mode_as_filter
 from fitting.setup import Choices
 from magjax.bench import load_bench
