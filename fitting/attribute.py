@@ -98,6 +98,9 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     result = fit(recordings, bench, actuator=actuator, extra=(*held, *names), choices=choices, refine=False, progress=progress, start=start, target=target)
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
+    if not result.converged and chi2_of(result) < target:  # far from the start: go on from there
+        start, more = result.solution.z[: result.problem.layout.density_unknowns + 1], (*held, *names)
+        result = fit(recordings, bench, actuator=result.actuator, extra=more, choices=choices, refine=False, progress=progress, start=start, target=target)
     drop = chi2_of(base) - chi2_of(result)
     physical = all(
         result.estimate(f"effects.{e.name}.{e.amplitude}").value >= 0

@@ -13,7 +13,21 @@ from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 
 from .alternation import alternating
-from .attribute import BIC_DROP, CLOSE, MIN_DROP, SETTLED_CHI2, STRUCTURES, TIE, WEAK_TIE, chi2_of, confidence, leaders, rivals_of, try_effect
+from .attribute import (
+    BIC_DROP,
+    CLOSE,
+    MIN_DROP,
+    SETTLED_CHI2,
+    STRUCTURES,
+    TIE,
+    WEAK_TIE,
+    chi2_of,
+    confidence,
+    family,
+    leaders,
+    rivals_of,
+    try_effect,
+)
 from .check import check_errors
 from .experiments import instrument_request, next_experiment
 from .fit import REFINE_BETWEEN, REST_SETTLED, fit
@@ -190,15 +204,22 @@ def _search(recordings, bench, base, candidates, choices, progress, check=()) ->
             break
         excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
         trials = []
-        for c in top:
-            settled = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
-            if settled and c.name not in STRUCTURES and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
-                continue
+
+        def attempt(c, trials=trials, excess=excess, chosen=chosen):
             say(f"trying {c.name}", 0, state.current.chi2_per_sample)
             reached = min((chi2_of(t.result) for t in trials if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
             trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress, bool(state.steps), reached)
             trials.append(trial)
             state.tried[c.name] = trial.candidate
+
+        for c in top:
+            settled = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
+            if settled and c.name not in STRUCTURES and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
+                continue
+            attempt(c)
+        first = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
+        for c in family(first.candidate, candidates, {t.name for t in trials}) if first else ():
+            attempt(c)
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
         if not good:
             break

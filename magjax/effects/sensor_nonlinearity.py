@@ -10,12 +10,12 @@ class SensorNonlinearity(AbstractEffect):
     """Departure from a straight line over the range of the sensor, of second to fourth order."""
 
     q2: Float[Array, ""] = param(0.0, "1", "quadratic departure at full range", scale=0.01, null=0.0, typical=(-0.1, 0.1))
-    q3: Float[Array, ""] = param(0.0, "1", "cubic departure at full range", scale=0.3, shape=True, typical=(-0.1, 0.1))
-    q4: Float[Array, ""] = param(0.0, "1", "departure of fourth order at full range", scale=0.3, shape=True, typical=(-0.1, 0.1))
+    c3: Float[Array, ""] = param(0.0, "1", "cubic departure relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0))
+    c4: Float[Array, ""] = param(0.0, "1", "departure of fourth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0))
 
     name = "sensor_nonlinearity"
     block = "sensor"
-    law = "reading = y + l (q2 (y/l)^2 + q3 (y/l)^3 + q4 (y/l)^4), l = saturation displacement"
+    law = "reading = y + l q2 r^2 (1 + c3 r + c4 r^2), r = y/l, l = saturation displacement"
     source = "linearity error of LVDTs, as in their data sheets"
     signature = "distortion that is a function of y alone at every frequency; a free density absorbs it at low frequency"
     amplitude = "q2"
@@ -24,4 +24,4 @@ class SensorNonlinearity(AbstractEffect):
         """Reading through the curve."""
         reach = actuator.magnetostriction.reach if actuator.magnetostriction is not None else 1.0
         part = reading / reach
-        return reading + reach * part * part * (self.q2 + part * (self.q3 + part * self.q4))
+        return reading + reach * part * part * self.q2 * (1 + part * (self.c3 + part * self.c4))
