@@ -19,6 +19,7 @@ FINER_TAKES = 0.7  # of the excess may be left
 REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
+VALLEY = 0.98  # correlation from which two parameters are one
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
@@ -136,7 +137,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
     cov = covariance(solution.normal, solution.z, problem.layout.density_unknowns)
     effective = float(np.trace(cov @ (solution.normal - prior_matrix(problem, solution.weights))))
     chi2n = solution.chi2 / count
-    message = outcome(chi2n, per_recording, solution, rows, problem) + unsettled(problem.spectra)
+    message = outcome(chi2n, per_recording, solution, rows, problem) + valleys(correlations(problem, refined)) + unsettled(problem.spectra)
     return FitResult(
         fitted, bench, bool(solution.converged), message, tuple(rows), correlations(problem, refined), per_recording, float(chi2n), count,
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
@@ -167,6 +168,12 @@ def recording_fits(problem, residual, recordings, bench):
             )
         )  # fmt: skip
     return tuple(rows)
+
+
+def valleys(found) -> str:
+    """The pairs of parameters that these recordings do not tell apart, in words: their priors do, if any."""
+    pairs = [f"{' and '.join(pair.split('~'))} (correlation {value:.2f})" for pair, value in found.items() if abs(value) > VALLEY]
+    return f"; a valley: only their priors part {', '.join(pairs)}" if pairs else ""
 
 
 def unsettled(spectra) -> str:

@@ -188,3 +188,15 @@ def test_a_bias_freed_with_a_prior_comes_back(recordings, bench):
     bias, resistance = got.estimate("coil.H_bias"), got.estimate("coil.R_eddy")
     assert got.chi2_per_sample < 1.3 and abs(bias.value - 1.23e4) < 4 * bias.stderr < 400
     assert abs(resistance.value / 62 - 1) < 0.02
+
+
+def test_lambda_s_freed_with_a_prior_comes_back_and_the_valley_is_told(recordings, bench):
+    """Stroke and mass scale make up for each other, and R_eddy with them: the errors are as wide as the prior lets them."""
+    name, true = "magnetostriction.lambda_s", 1.313e-3
+    stated = dataclasses.replace(bench, priors={name: 0.02 * true})
+    got = fit(recordings, stated, actuator=bench.actuator().replace({name: 0.98 * true}), extra=(name,), choices=QUICK, refine=False)
+    stroke, resistance = got.estimate(name), got.estimate("coil.R_eddy")
+    assert got.converged and got.chi2_per_sample < 1.1
+    assert abs(stroke.value - true) < 3 * stroke.stderr < 0.1 * true
+    assert abs(resistance.value - 62) < 3 * resistance.stderr and resistance.stderr > 0.4
+    assert "a valley" in got.message and "lambda_s" in got.message
