@@ -12,8 +12,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small dense solves: more t
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fitting.diagnose import diagnose
 from fitting.demo import SINES, concealed_actuator
+from fitting.diagnose import diagnose
 from fitting.fit import fit
 from fitting.instruments import known_instruments, line_gains, mode_as_filter
 from fitting.setup import Choices
