@@ -19,6 +19,16 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+STRICT = {"test_fit", "test_preisach", "test_transients"}  # simulation, operator and fit: no rank is promoted by accident
+
+
+@pytest.fixture(autouse=True, scope="module")
+def ranks(request):
+    """In the modules of STRICT arrays of unlike rank do not meet."""
+    with jax.numpy_rank_promotion("raise" if request.module.__name__.rpartition(".")[2] in STRICT else "allow"):
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def release_programs():
     """Compiled programs of a module are dropped after it: each holds many memory mappings."""
