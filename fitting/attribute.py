@@ -23,6 +23,8 @@ BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
 WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
 SAME_DIRECTION = 0.97
+MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
+MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +122,8 @@ def rivals_of(best: Trial, trials) -> list[Trial]:
             continue
         behind = t.bic_change - best.bic_change
         weak = min(WEAK_TIE[0] * best.drop, WEAK_TIE[1]) if t.result.chi2_per_sample < SETTLED_CHI2 else 0.0
-        if behind < max(TIE, weak) or (behind < 2 * TIE and _same(t, best)):
+        rest = chi2_of(best.result) if best.result.chi2_per_sample > MISFIT else 0.0
+        if behind < max(TIE, weak, MISFIT_TIE * rest) or (behind < 2 * TIE and _same(t, best)):
             tied.append(t)
     return sorted(tied, key=lambda t: t.bic_change)
 
