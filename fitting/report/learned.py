@@ -73,7 +73,8 @@ def learned_function(unknown, stem: str = "learned"):
         for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
             axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
         axes.axhline(0, color=MUTED, lw=0.5)
-        axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room), xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}")
+        axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room))
+        axes.set(xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}")
         if len(unknown["function"]["slices"]) > 1:
             axes.legend(loc="best")
         caption = (
