@@ -190,6 +190,7 @@ def test_a_bias_freed_with_a_prior_comes_back(recordings, bench):
     assert abs(resistance.value / 62 - 1) < 0.02
 
 
+@pytest.mark.long
 def test_lambda_s_freed_with_a_prior_comes_back_and_the_valley_is_told(recordings, bench):
     """Stroke and mass scale make up for each other, and R_eddy with them: the errors are as wide as the prior lets them."""
     name, true = "magnetostriction.lambda_s", 1.313e-3

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
-LONG = ("03", "06", "07")
+LONG = ("02", "03", "06", "07")
 SOURCES = [pytest.param(p, marks=[pytest.mark.long] if p.name.startswith(LONG) else [], id=p.stem) for p in sorted(FOLDER.glob("0*.py"))]
 
 

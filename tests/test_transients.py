@@ -56,6 +56,7 @@ def test_nothing_is_taken_out_where_nothing_of_the_kind_is(other):
     assert unsettled_starts(spectra(**other), 392.0, 0.7783) == [None] * 9
 
 
+@pytest.mark.long
 def test_a_fit_of_unsettled_records_reaches_the_noise():
     bench = load_bench("aa-050h")
     truth, rng = concealed_actuator(bench), np.random.default_rng(7)
