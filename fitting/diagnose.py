@@ -17,6 +17,7 @@ from .attribute import (
     BIC_DROP,
     CLOSE,
     MIN_DROP,
+    MISFIT,
     SETTLED_CHI2,
     STRUCTURES,
     TIE,
@@ -29,8 +30,8 @@ from .attribute import (
     try_effect,
 )
 from .check import check_errors
-from .experiments import instrument_request, next_experiment
-from .fit import REFINE_BETWEEN, REST_SETTLED, fit
+from .experiments import INSTRUMENTS, instrument_request, next_experiment
+from .fit import REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER, fit
 from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, exchange, known_instruments
 from .learned import with_learned_term
@@ -228,7 +229,7 @@ def _search(recordings, bench, base, candidates, choices, progress, check=()) ->
             break
         if state.steps and check and _predicts_worse(state.current.actuator, best.result.actuator, check, bench):
             break
-        best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress)
+        best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress, choices.rest == "auto")
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
         candidates = _screen(best.result, choices)
@@ -266,15 +267,21 @@ def _backward(recordings, bench, state, chosen, count, progress):
             state.current = trial
 
 
-def _finer(recordings, bench, current, best, good, chosen, excess, progress):
+def _finer(recordings, bench, current, best, good, chosen, excess, progress, any_rest: bool = True):
     """The best with another start memory and with a finer density where it still leaves something: both were chosen under
-    the misfit of the base. Where that changes them, the near rivals are tried again on the same."""
+    the misfit of the base. Where that changes them, the near rivals are tried again on the same.
+
+    Start memories that serve as well foretell other mean levels: the one that is tried first stands unless another is
+    better by MIN_DROP.
+    """
     names = tuple(e.name for e in best.result.estimates if e.name.startswith("effects."))
     found = chosen
-    if bench.start == "auto" and best.result.chi2_per_sample > REST_SETTLED:
+    later = chosen.rest != RESTS_IN_ORDER[0]
+    if any_rest and bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
         free = dataclasses.replace(chosen, rest="auto")
         other = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=free, refine=False, progress=progress)
-        if chi2_of(other) < chi2_of(best.result) - MIN_DROP:
+        margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
+        if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices
     if chosen.knots is not None and REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BETWEEN[1]:
         found = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=found, refine=True, progress=progress).choices
@@ -324,18 +331,22 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
         return Diagnosis("nothing_missing", text, **common)
     better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
     swap, asked = exchange(state.current, bench), None
+    measured = all(r.origin.get("metadata", {}).get("current") == "measured" for r in recordings)
     if swap:
-        measured = all(r.origin.get("metadata", {}).get("current") == "measured" for r in recordings)
         asked = instrument_request({"sensor"} if measured else {"source", "sensor"})
         if swap[1] and not any("sensor_lag" in g for g in groups):
             effects = [e for e in effects if e["name"] != "sensor_lag"]
             groups.append(["sensor_lag", "second_mode"])
     if groups:
-        experiment = asked or (next_experiment(last_rivals, base.spectra, bench, base_now.problem.noise_rms) if last_rivals else None)
+        blocks = {t.candidate.block for t in last_rivals}
+        between = bool(blocks & set(INSTRUMENTS)) and not blocks <= set(INSTRUMENTS)
+        also = INSTRUMENTS if between and excess > MISFIT and not measured and bench.drive == "current" else ()  # more than one is amiss
+        experiment = asked or (next_experiment(last_rivals, base.spectra, bench, also) if last_rivals else None)
         names = "; ".join(" or ".join(g) for g in groups)
         text = f"something is missing that these recordings cannot tell apart: {names}."
         if effects:
             text += f" Found beside it: {', '.join(e['name'] for e in effects)}."
+        text += " Instruments and actuator are not told apart by these channels." if between and not swap else ""
         text += f" {swap[0]}" if swap else ""
         text += f" chi2/N falls from {base.chi2_per_sample:.3g} to {excess:.2f}." if swap else ""
         if experiment:

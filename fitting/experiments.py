@@ -51,12 +51,15 @@ def instrument_request(blocks, reason: str = "") -> dict:
     return {"text": f"record {' and '.join(wanted)}{reason}", "drive": None, "channels": wanted, "separates": []}
 
 
-def next_experiment(trials, spectra, bench, noise_rms: float) -> dict | None:
-    """A sine of the menu that separates the rivals best, and the channel that would settle it outright."""
+def next_experiment(trials, spectra, bench, also=()) -> dict | None:
+    """A sine of the menu that separates the rivals best, and the channel that would settle it outright.
+
+    `also`: blocks beside the rivals' own that are in question.
+    """
     if len(trials) < 2:
         return None
     trials = trials[:3]
-    wanted = channels_for({t.candidate.block for t in trials})
+    wanted = channels_for({*(t.candidate.block for t in trials), *also})
     names = [t.name for t in trials]
     drives = menu(spectra, bench)
     apart = separations(trials, drives, spectra)

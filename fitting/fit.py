@@ -55,13 +55,14 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
 
 
 RESTS = {"negative_saturation": "negative", "demagnetized": "demagnetized", "positive_saturation": "positive"}
+RESTS_IN_ORDER = tuple(RESTS.values())
 
 
 def _rests(bench, choices):
     """Start memories to try, in order."""
     if choices.rest != "auto":
         return (choices.rest,)
-    return (RESTS[bench.start],) if bench.start in RESTS else ("negative", "demagnetized", "positive")
+    return (RESTS[bench.start],) if bench.start in RESTS else RESTS_IN_ORDER
 
 
 def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):

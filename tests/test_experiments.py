@@ -58,7 +58,7 @@ def test_a_sine_is_proposed_only_where_it_decides(monkeypatch, gap, sine):
     rows = {"sensor_lag": np.zeros((len(drives), 2)), "delta_e": np.zeros((len(drives), 2))}
     rows["delta_e"][3] = gap
     monkeypatch.setattr(experiments, "_predicted", lambda result, drives, spectra: known(rows[result]))
-    found = next_experiment([rival("sensor_lag", "sensor"), rival("delta_e", "mechanics")], SPECTRA, load_bench("aa-050h"), 4e-8)
+    found = next_experiment([rival("sensor_lag", "sensor"), rival("delta_e", "mechanics")], SPECTRA, load_bench("aa-050h"))
     assert found["channels"] == [CALIBRATION] and found["text"].startswith("record a calibration")
     assert (found["drive"] is not None) == sine and bool(found["separates"]) == sine
     if sine:

@@ -111,7 +111,7 @@ def act(instruments: bool, density: str = "gauss", choices: Choices | None = Non
     begin = time.perf_counter()
     found = diagnose(
         runs, load_bench("aa-050h"), check=checks, calibration=calibrations() if instruments else (),
-        choices=choices or Choices(rest="demagnetized", fine=250), progress=progress,
+        choices=choices or Choices(fine=250), progress=progress,
     )  # fmt: skip
     return part(found, time.perf_counter() - begin)
 
