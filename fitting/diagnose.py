@@ -43,6 +43,7 @@ from .setup import Choices, spectra_of
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 Z_THRESHOLD = 5.5  # about forty columns are looked at
 RECORD_Z = 8.0
+ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 MAX_EFFECTS = 3
@@ -139,6 +140,9 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common)
     if found.verdict == "unknown_at":
         found = with_learned_term(found, base_now, recordings, bench, check, progress)
+        silent = not state.steps and state.current.chi2_per_sample < ROUGH_CHI2 and abs(candidates[0].z if candidates else 0.0) < Z_THRESHOLD
+        if silent and "function" not in found.unknown:  # nor does a smooth function of the signals: no place can be told
+            found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common, rough=True)
     if placebo_runs > 0:
         found = dataclasses.replace(found, placebo=placebo(state.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress))
     if zero is None:
@@ -294,7 +298,8 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress, any
     return min(again, key=lambda t: t.bic_change), again, found
 
 
-def _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common) -> Diagnosis:
+def _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common, rough: bool = False) -> Diagnosis:
+    """`rough`: what is left has been looked for and is put down to the density."""
     ranked = tuple(state.tried.get(c.name, c) for c in candidates)
     before = base.actuator
     after = state.current.actuator
@@ -318,7 +323,7 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     count = base_now.data_count
     missing = excess > SILENT_CHI2 + 3 * np.sqrt(2 / count)
     share = 1 - max(excess - 1, 0) / max(base_now.chi2_per_sample - 1, 1e-9) if base_now.chi2_per_sample > SILENT_CHI2 else 1.0
-    if missing and (not state.steps or share < FULL_SHARE or excess > FAR_FROM_NOISE):
+    if missing and not rough and (not state.steps or share < FULL_SHARE or excess > FAR_FROM_NOISE):
         return _unknown(state, share, excess, common)
     worse = [r for r in rows if r["rms_after"] > 1.05 * r["rms_before"] and r["rms_after"] > 1.3 * r["noise_rms"]]
     if state.steps and rows and len(worse) == len(rows):  # a repair that predicts nothing better is not physics
@@ -326,6 +331,8 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     if not effects and not groups:
         text = f"nothing is missing: chi2/N = {excess:.2f} and no effect of the catalogue scores above {Z_THRESHOLD} (highest: "
         text += f"{candidates[0].name}, z = {candidates[0].z:.1f})." if candidates else "none)."
+        if rough:
+            text += " What is left above the noise follows no smooth function of the signals either: a density rougher than the fit's, most likely."
         if common["absorbed"]:
             text += f" These recordings could not show {', '.join(common['absorbed'])}: the density absorbs them."
         return Diagnosis("nothing_missing", text, **common)

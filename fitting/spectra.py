@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 HARMONICS = 40
+DRIFT_ZERO = 0.25  # of a drift's size: where it had begun is not known
 LOW_ORDERS = 10  # of a converter's integral nonlinearity
 
 
@@ -41,6 +42,7 @@ class Spectrum:
     systematic: np.ndarray | None = None  # what the converters leave in each reading line, deviation of its parts
     gain_accuracy: float = 0.0  # the reading's scale in this recording, relative standard deviation
     hum: tuple[tuple[float, float], ...] | None = None  # frequency, Hz, and amplitude of tones taken out where they can be told
+    drift: float = 0.0  # size of what was taken out of the reading as a drift of this recording alone
     start: np.ndarray | None = None  # decaying motion of an unsettled start, taken out of the reading, (samples,)
 
     @property
@@ -109,6 +111,7 @@ def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMON
         float(np.ptp(y)), drive_noise, (recording.noise or {}).get(output),
         systematic=systematic_deviations(lines, drive_lines, frequency, drive_step, columns.get(output, {}), float(np.ptp(y))),
         gain_accuracy=float(columns.get(output, {}).get("gain_accuracy", 0.0)), hum=recording.origin.get("hum"),
+        drift=float(recording.origin.get("drift", 0.0)),
     )  # fmt: skip
 
 
@@ -200,7 +203,8 @@ def with_noise(spectra) -> tuple:
     """The spectra with their noise: pooled, or each its own where the bins between the harmonics say that they differ.
 
     They do where their likelihood rises by 40 a recording, or by 12 with levels more than twofold apart (noise in
-    proportion to loops of different size): pooling these would double the errors of the parameters.
+    proportion to loops of different size): pooling these would double the errors of the parameters. What is left of
+    drifts that differ, differs too: there 6 are enough.
     """
     pooled = estimate_noise(spectra)
     own = []
@@ -213,7 +217,8 @@ def with_noise(spectra) -> tuple:
         a, b = pooled.density(s.between_f), mine.density(s.between_f)
         gain += float(np.sum(np.log(a) + s.between_power / a - np.log(b) - s.between_power / b))
     levels = [float(np.mean(s.between_power)) for s in spectra]
-    differ = gain > 40 * len(spectra) or (gain > 12 * len(spectra) and max(levels) > 2 * min(levels))
+    least = 6 if any(s.drift for s in spectra) else 40
+    differ = gain > least * len(spectra) or (gain > 12 * len(spectra) and max(levels) > 2 * min(levels))
     return tuple(dataclasses.replace(s, noise=n if differ else pooled) for s, n in zip(spectra, own, strict=True))
 
 
@@ -228,6 +233,7 @@ def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
         away = np.abs(np.arange(count) * spectrum.frequency - tone)
         left = np.where(away < 0.6 * lowest, 1.0, 0.25 * np.minimum(1.0, lowest / (np.pi * np.maximum(away, lowest))))
         variance = variance + (left * amplitude) ** 2 / 4
+    variance[0] += (DRIFT_ZERO * spectrum.drift) ** 2
     variance = np.where(np.arange(count) == 0, variance, 0.5 * variance)
     return np.sqrt(variance if spectrum.systematic is None else variance + spectrum.systematic**2)
 
