@@ -26,15 +26,16 @@ def prediction(actuator, recording, bench):
     return predicted, measured, s.noise_rms
 
 
-def check_errors(before, after, recordings, bench) -> list[dict]:
-    """rms error on each check recording before and after the repair."""
+def check_errors(before, after, recordings, bench, cleaned=None) -> list[dict]:
+    """rms error on each check recording before and after the repair; `cleaned`: what the repaired model is held against,
+    the recordings without the drift, heat or hum that it names."""
     unit = {"displacement": "m", "flux_density": "T"}.get(bench.output, "A/m")
     rows = []
-    for recording in recordings:
+    for recording, clean in zip(recordings, recordings if cleaned is None else cleaned, strict=True):
         errors = []
         noise = None
-        for actuator in (before, after):
-            predicted, measured, noise = prediction(actuator, recording, bench)
+        for actuator, reading in ((before, recording), (after, clean)):
+            predicted, measured, noise = prediction(actuator, reading, bench)
             errors.append(float(np.sqrt(np.mean((predicted - measured) ** 2))))
         rows.append(
             {"file": recording.origin.get("file", recording.name), "channel": bench.output, "unit": unit,

@@ -32,7 +32,7 @@ from .attribute import (
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .fit import REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER, fit
-from .floors import data_problem, record_effects, remove_record_effect, solver_floor, wrong_bench
+from .floors import data_problem, record_effects, remove_from_checks, remove_record_effect, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, exchange, known_instruments
 from .learned import with_learned_term
 from .locate import where
@@ -126,6 +126,7 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
         free = held if zero is None else (*held, "sensor.offset")
         base = fit(recordings, bench, actuator=actuator, extra=free, choices=base_now.choices, progress=progress, refine=False)
     recordings = cleaned
+    cleaned_check = remove_from_checks(check, [e for e, _ in adopted], bench)
     candidates = _screen(base_now, choices)
     noise = base_now.problem.noise_rms
     floors = {
@@ -135,14 +136,15 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     }
     place = where(base_now, candidates, recordings, bench.output)
     absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY)
-    state = _search(recordings, bench, base_now, candidates, choices, progress, check)
+    state = _search(recordings, bench, base_now, candidates, choices, progress, cleaned_check)
     common = {"floors": floors, "where": place, "absorbed": absorbed, "base": base}
-    found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common)
+    checks = (check, cleaned_check)
+    found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, checks, common)
     if found.verdict == "unknown_at":
-        found = with_learned_term(found, base_now, recordings, bench, check, progress)
+        found = with_learned_term(found, base_now, recordings, bench, cleaned_check, progress)
         silent = not state.steps and state.current.chi2_per_sample < ROUGH_CHI2 and abs(candidates[0].z if candidates else 0.0) < Z_THRESHOLD
         if silent and "function" not in found.unknown:  # nor does a smooth function of the signals: no place can be told
-            found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common, rough=True)
+            found = _verdict(state, adopted, base, base_now, candidates, recordings, bench, checks, common, rough=True)
     if placebo_runs > 0:
         found = dataclasses.replace(found, placebo=placebo(state.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress))
     if zero is None:
@@ -298,12 +300,13 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress, any
     return min(again, key=lambda t: t.bic_change), again, found
 
 
-def _verdict(state, adopted, base, base_now, candidates, recordings, bench, check, common, rough: bool = False) -> Diagnosis:
-    """`rough`: what is left has been looked for and is put down to the density."""
+def _verdict(state, adopted, base, base_now, candidates, recordings, bench, checks, common, rough: bool = False) -> Diagnosis:
+    """`checks`: the check recordings as they came, and without the record-level signals; `rough`: what is left has been
+    looked for and is put down to the density."""
     ranked = tuple(state.tried.get(c.name, c) for c in candidates)
     before = base.actuator
     after = state.current.actuator
-    rows = tuple(check_errors(before, after, check, bench)) if check else ()
+    rows = tuple(check_errors(before, after, checks[0], bench, checks[1])) if checks[0] else ()
     excess = state.current.chi2_per_sample
     effects, groups = [], []
     for effect, rivals in adopted:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .model import Predictor, predicted_lines
-from .spectra import fit_lines
+from .spectra import fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
@@ -161,6 +161,25 @@ def remove_record_effect(recordings, effect, output):
         elif effect.shapes.get("own"):
             origin = {**origin, "drift": float(np.abs(column).max())}
         cleaned.append(Recording(recording.time, channels, recording.noise, origin, recording.name))
+    return cleaned
+
+
+def remove_from_checks(recordings, adopted, bench):
+    """Check recordings without the record-level signals that were `adopted` from the others; each record's own drift and
+    hum are found between its own harmonics. Recordings that do not repeat come back as they are."""
+    cleaned = []
+    for recording in recordings:
+        for effect in adopted if recording.frequency() is not None else ():
+            spectra = with_noise([reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)])
+            if effect.name == "mains_hum":
+                columns = tuple(_hum(spectra, effect.shapes["f"])[2])
+            elif effect.shapes.get("own"):
+                columns = (drift_of(spectra[0])[1],)
+            else:
+                same = [c for n, shapes, c in record_columns([recording], spectra) if (n, shapes) == (effect.name, effect.shapes)]
+                columns = tuple(same[0])
+            recording = remove_record_effect([recording], dataclasses.replace(effect, columns=columns), bench.output)[0]
+        cleaned.append(recording)
     return cleaned
 
 
