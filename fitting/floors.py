@@ -14,6 +14,7 @@ from .spectra import fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
+OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record by itself, and the share of records that must show it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +90,8 @@ def _own_drifts(spectra, common: float) -> RecordEffect | None:
     """Drift of each record by itself, where that serves better (BIC) than the `common` rate, scored by z; None elsewhere."""
     gains, fits = zip(*(drift_of(s) for s in spectra), strict=True)
     extra, count = 2 * len(spectra), sum(s.samples for s in spectra)
-    if sum(gains) - common**2 < extra * np.log(count):
+    shown = np.mean(np.asarray(gains) > OWN_GAIN)  # a hum looks like a drift in short records only
+    if shown < OWN_SHARE or sum(gains) - common**2 < extra * np.log(count):
         return None
     ends = np.array([f[-1] / (s.dt * s.samples) for f, s in zip(fits, spectra, strict=True)])
     rate = float(np.median(ends))

@@ -1,0 +1,92 @@
+"""What adds to a record besides the loop: drift at a common rate, of each record by itself, hum; and check recordings without it."""
+
+import numpy as np
+import pytest
+
+from fitting.floors import data_problem, record_effects, remove_from_checks, remove_record_effect
+from fitting.setup import spectra_of
+from magjax.bench import load_bench
+from magjax.recording import Recording
+
+BENCH = load_bench("aa-050h")
+FREQUENCIES = (10.0, 50.0, 120.0, 300.0)
+NOISE = 4e-8
+
+
+def records(beside=lambda t: 0.0, frequencies=FREQUENCIES, seed=4):
+    """Four periods of a bent loop with noise, and what `beside` adds to each."""
+    rng, runs = np.random.default_rng(seed), []
+    for f in frequencies:
+        t = np.arange(2000) / (500 * f)
+        current = 0.8 * np.sin(2 * np.pi * f * t)
+        y = 2e-5 + 2e-5 * current + 5e-6 * current**3 + NOISE * rng.standard_normal(len(t)) + beside(t)
+        runs.append(Recording(t, {"current": current, "displacement": y}, name=f"{f:g} Hz"))
+    return runs
+
+
+def scored(runs):
+    """Record-level effects of recordings, best first."""
+    return record_effects(runs, spectra_of(runs, BENCH))
+
+
+def test_nothing_beside_the_loop_scores():
+    assert max(abs(e.z) for e in scored(records())) < 4
+
+
+def test_a_common_rate_is_one_drift():
+    best = next(e for e in scored(records(lambda t: 2e-6 * t)) if e.name == "zero_drift")
+    assert best.z > 10 and not best.shapes
+    assert best.amplitude == pytest.approx(2e-6, abs=4 * best.stderr) and best.stderr < 2e-7
+
+
+@pytest.mark.parametrize("shape", [lambda u: u, np.sqrt], ids=["straight", "root"])
+def test_drifts_of_the_same_size_in_long_and_short_records_are_each_their_own(shape):
+    size = 4e-7
+    runs = records(lambda t: size * shape(t / t[-1]))
+    best = scored(runs)[0]
+    assert best.name == "zero_drift" and best.shapes == {"own": True} and best.z > 20
+    for column in best.columns:
+        assert column[-1] == pytest.approx(size, rel=0.2)
+    plain = records()
+    for clean, bare, drifted in zip(remove_record_effect(runs, best, "displacement"), plain, runs, strict=True):
+        left, there = (np.std(x.channels["displacement"] - bare.channels["displacement"]) for x in (clean, drifted))
+        assert left < 0.25 * there
+    assert all(s.drift == pytest.approx(size, rel=0.25) for s in spectra_of(remove_record_effect(runs, best, "displacement"), BENCH))
+
+
+def test_hum_beside_the_drift_does_not_pass_for_it():
+    runs = records(lambda t: 2e-7 * np.sin(2 * np.pi * 50.01 * t + 1), frequencies=(10.0, 23.0, 80.0, 120.0))
+    best = scored(runs)[0]
+    assert best.name == "mains_hum" and best.shapes["f"] == 50.0
+
+
+def test_a_strong_drift_of_a_short_record_is_no_data_problem():
+    """Periods that differ by what one straight drift and its root explain repeat; a decaying swing does not."""
+    for beside, wrong in ((lambda t: 1.2e-6 * np.sqrt(t / t[-1]), False), (lambda t: 2e-6 * np.exp(-t / t[-1] * 2.7) * np.cos(9.3 * t / t[-1]), True)):
+        runs = records(beside)
+        found = data_problem(runs, spectra_of(runs, BENCH), "displacement")
+        assert (found is not None) is wrong
+
+
+def test_check_recordings_lose_what_was_adopted_and_no_more():
+    size = 4e-7
+    runs = records(lambda t: size * t / t[-1])
+    (check,) = records(lambda t: size * t / t[-1], (77.0,), seed=9)
+    (bare,) = records(frequencies=(77.0,), seed=9)
+    drift = scored(runs)[0]
+    (clean,) = remove_from_checks([check], [drift], BENCH)
+    left = clean.channels["displacement"] - bare.channels["displacement"]
+    assert np.abs(left).max() < 0.15 * size
+    (same,) = remove_from_checks([check], [], BENCH)
+    assert np.array_equal(same.channels["displacement"], check.channels["displacement"])
+    aperiodic = Recording(check.time, {"current": np.linspace(0, 1, len(check.time)) ** 2, "displacement": check.channels["displacement"]}, name="ramp")
+    assert remove_from_checks([aperiodic], [drift], BENCH) == [aperiodic]
+
+
+def test_check_recordings_lose_heat_at_the_amplitude_that_the_others_show():
+    runs = records(lambda t: 8e-6 * 0.32 * 0.3 * (1 - np.exp(-t / 0.3)))
+    heat = next(e for e in scored(runs) if e.name == "thermal_drift")
+    (check,) = records(lambda t: 8e-6 * 0.32 * 0.3 * (1 - np.exp(-t / 0.3)), (7.0,), seed=9)
+    (bare,) = records(frequencies=(7.0,), seed=9)
+    before, after = (np.std(x.channels["displacement"] - bare.channels["displacement"]) for x in (check, *remove_from_checks([check], [heat], BENCH)))
+    assert after < 0.2 * before
