@@ -134,10 +134,40 @@ def table(suite: str, rows) -> str:
         lines.append(
             f"90 % intervals of R_eddy, xi, f0 hold the truth in {np.mean(covered):.0%} ({low:.0%} to {high:.0%}, {len(covered)})."
         )
+    lines += _foretold(rows)
     if blocks:
         lines.append(f"unknown_at names the right block in {sum(blocks)} of {len(blocks)}.")
     lines.append(f"Time of one diagnosis, compilation included: median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s.")
-    return "\n".join([*lines, *_by_sight(rows)]) + "\n\n" + confusion(rows)
+    return "\n".join([*lines, *_believed(rows), *_by_sight(rows)]) + "\n\n" + confusion(rows)
+
+
+def _foretold(rows) -> list[str]:
+    """Error on check recordings after the diagnosis in units of their noise, where nothing outside the catalogue acts."""
+    lines = []
+    for title, kinds in (("nulls", ("null", "decoy", "hidden")), ("one effect or two", ("single", "pair"))):
+        ratios = [c["rms_after"] / c["noise_rms"] for case, d, _ in rows if d and case.kind in kinds for c in d["check"] if c["noise_rms"]]
+        if ratios:
+            middle, high = np.quantile(ratios, (0.5, 0.9))
+            lines.append(f"Check error after the diagnosis over the noise, {title}: median {middle:.2f}, nine tenths below {high:.2f} ({len(ratios)}).")
+    return lines
+
+
+def _believed(rows) -> list[str]:
+    """Whether a stated confidence means what it says: share of the named effects that are concealed, by confidence."""
+    bands = {"below 0.6": [], "0.6 to 0.9": [], "0.9 to 0.98": [], "above 0.98": []}
+    for case, diagnosis, _ in rows:
+        for effect in diagnosis["effects"] if diagnosis else ():
+            band = next(b for b, top in zip(bands, (0.6, 0.9, 0.98, 1.1), strict=True) if effect["confidence"] < top)
+            bands[band].append((effect["name"] in case.effects, effect["confidence"]))
+    if not any(bands.values()):
+        return []
+    lines = ["", "| stated confidence | named | mean stated | truly concealed, 95 % |", "|---|---|---|---|"]
+    for band, got in bands.items():
+        if got:
+            true = sum(t for t, _ in got)
+            low, high = wilson(true, len(got))
+            lines.append(f"| {band} | {len(got)} | {np.mean([c for _, c in got]):.2f} | {true}/{len(got)}: {low:.0%} to {high:.0%} |")
+    return lines
 
 
 def _by_sight(rows):
