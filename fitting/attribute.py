@@ -37,6 +37,7 @@ class Trial:
     bic_change: float
     physical: bool
     explained_share: float
+    parameters: int = 0
 
     @property
     def name(self) -> str:
@@ -111,16 +112,19 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     )
     extra = len(names) * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
-    return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)))
+    return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), len(names))
 
 
 def rivals_of(best: Trial, trials) -> list[Trial]:
-    """Trials that the data do not tell from the best, the best first."""
+    """Trials that the data do not tell from the best, the best first.
+
+    By BIC or by AIC, whichever sees them nearer: shapes are held by priors and cost less than BIC charges.
+    """
     tied = [best]
     for t in trials:
         if t is best or not t.physical:
             continue
-        behind = t.bic_change - best.bic_change
+        behind = min(t.bic_change - best.bic_change, best.drop - t.drop + 2 * (t.parameters - best.parameters))
         weak = min(WEAK_TIE[0] * best.drop, WEAK_TIE[1]) if t.result.chi2_per_sample < SETTLED_CHI2 else 0.0
         rest = chi2_of(best.result) if best.result.chi2_per_sample > MISFIT else 0.0
         if behind < max(TIE, weak, MISFIT_TIE * rest) or (behind < 2 * TIE and _same(t, best)):

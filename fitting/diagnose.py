@@ -43,6 +43,8 @@ from .setup import Choices, spectra_of
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 Z_THRESHOLD = 5.5  # about forty columns are looked at
 RECORD_Z = 8.0
+HALF = 0.5  # of the excess over NULL_CHI2 must be taken where the plain fit all but meets the noise
+NULL_CHI2 = 0.95
 ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
@@ -304,6 +306,9 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     """`checks`: the check recordings as they came, and without the record-level signals; `rough`: what is left has been
     looked for and is put down to the density."""
     ranked = tuple(state.tried.get(c.name, c) for c in candidates)
+    dropped = _too_little(state, base_now)
+    if dropped:
+        state = dataclasses.replace(state, current=base_now, steps=[])
     before = base.actuator
     after = state.current.actuator
     rows = tuple(check_errors(before, after, checks[0], bench, checks[1])) if checks[0] else ()
@@ -332,8 +337,12 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     if state.steps and rows and len(worse) == len(rows):  # a repair that predicts nothing better is not physics
         return _unknown(state, share, excess, common, " The repair that fits best predicts every check recording worse, so it is not named.")
     if not effects and not groups:
-        text = f"nothing is missing: chi2/N = {excess:.2f} and no effect of the catalogue scores above {Z_THRESHOLD} (highest: "
-        text += f"{candidates[0].name}, z = {candidates[0].z:.1f})." if candidates else "none)."
+        text = f"nothing is missing: chi2/N = {excess:.2f} and "
+        if dropped:
+            text += f"{dropped}, which serves best, takes less than half of what is above the noise."
+        else:
+            text += f"no effect of the catalogue scores above {Z_THRESHOLD} (highest: "
+            text += f"{candidates[0].name}, z = {candidates[0].z:.1f})." if candidates else "none)."
         if rough:
             text += " What is left above the noise follows no smooth function of the signals either: a density rougher than the fit's, most likely."
         if common["absorbed"]:
@@ -368,6 +377,18 @@ def _verdict(state, adopted, base, base_now, candidates, recordings, bench, chec
     if swap:
         text += f" {swap[0]} To tell: {asked['text']}."
     return Diagnosis("attributed", text, tuple(effects), next_experiment=asked, **common)
+
+
+def _too_little(state, base) -> str | None:
+    """The names of effects that all but meet the noise but take less than half of what the plain fit leaves above it: what a rough
+    density leaves looks like a weak effect, but no effect takes it up."""
+    least = SILENT_CHI2 + 3 * np.sqrt(2 / base.data_count)
+    if not state.steps or not state.current.chi2_per_sample < least:
+        return None
+    taken = base.chi2_per_sample - state.current.chi2_per_sample
+    if taken > HALF * (base.chi2_per_sample - NULL_CHI2):
+        return None
+    return " and ".join(best.name for best, *_ in state.steps)
 
 
 def _unknown(state, share, excess, common, note: str = "") -> Diagnosis:
