@@ -15,7 +15,7 @@ class ZeroDrift(AbstractEffect):
     block = "sensor"
     law = "reading = y + rate t"
     source = "warm-up of sensor electronics"
-    signature = "a ramp through every record at the same rate, whatever the drive"
+    signature = "a ramp through every record, whatever the drive: at one rate, or of each record by itself, bent as warming up is"
     amplitude = "rate"
     record_level = True
 

@@ -1,0 +1,105 @@
+"""The rules of attribution by themselves: who is tried, who is told apart, what is too little to be named."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of
+from fitting.diagnose import _State, _too_little
+from fitting.screen import Candidate
+
+COUNT = 700
+
+
+def candidate(name, z, direction=(1.0, 0.0, 0.0), visibility=0.1):
+    """A score."""
+    d = np.asarray(direction, float)
+    return Candidate(name, "mechanics", z, visibility, 1.0, {}, z * z, 0.1, False, d / np.linalg.norm(d))
+
+
+def trial(name, chi2n, parameters=1, base=3.0, physical=True, direction=(1.0, 0.0, 0.0)):
+    """A fit that ended at chi2/N."""
+    drop = (base - chi2n) * COUNT
+    result = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
+    return Trial(candidate(name, 20.0, direction), result, drop, parameters * np.log(COUNT) - drop, physical, drop / ((base - 0.92) * COUNT), parameters)
+
+
+def names(found):
+    """Their names."""
+    return [x.name for x in found]
+
+
+def test_leaders_are_the_best_of_each_family_and_structures():
+    rows = [
+        candidate("sensor_lag", 50.0), candidate("transport_delay", -49.0, (1, 0.1, 0)), candidate("creep", 30.0, (0, 1, 0)),
+        candidate("duffing_stiffness", 10.0, (0, 0, 1)), candidate("delta_e", 40.0, (0, 1, 0.05), visibility=1e-4),
+        candidate("eddy_currents", 0.5, (0, 1, 1)),
+    ]  # fmt: skip
+    chosen = leaders(rows)
+    # a mate of the first, one too weak beside it and one that the base hides are not tried; a structure always is
+    assert names(chosen) == ["sensor_lag", "creep", "eddy_currents"]
+    assert names(family(rows[0], rows, {"sensor_lag", "creep"})) == ["transport_delay"]
+    assert names(family(candidate("transport_delay", 49.0), [candidate("sensor_lag", 5.0, (0, 1, 0))], set())) == ["sensor_lag"]
+    assert leaders([candidate("creep", 2.0)]) == []
+
+
+def test_rivals_are_those_that_the_data_do_not_tell_apart():
+    best = trial("backlash", 1.200)
+    by_parameters = trial("coulomb_friction", 1.199, parameters=3, direction=(0, 1, 0))  # BIC charges two shapes 13, AIC 4
+    behind = trial("creep", 1.26, direction=(0, 0, 1))
+    unphysical = trial("excess_loss", 1.19, physical=False)
+    assert best.bic_change - by_parameters.bic_change == pytest.approx(0.7 - 2 * np.log(COUNT))
+    assert names(rivals_of(best, [best, by_parameters, behind, unphysical])) == ["backlash", "coulomb_friction"]
+
+
+def test_rivals_where_the_best_is_not_the_whole_truth():
+    best, near, far = trial("second_mode", 2.0, base=300.0), trial("sensor_lag", 2.15, base=300.0), trial("creep", 2.5, base=300.0)
+    assert names(rivals_of(best, [best, near, far])) == ["second_mode", "sensor_lag"]
+
+
+def test_confidence_falls_with_rivals_and_with_what_is_left():
+    alone, rival = trial("backlash", 0.92), trial("creep", 0.9201, direction=(0, 1, 0))
+    assert confidence(alone, [alone]) == 0.99
+    assert 0.45 < confidence(alone, [alone, rival]) < 0.55
+    assert confidence(trial("backlash", 2.0), [trial("backlash", 2.0)]) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("base", "after", "named"),
+    [(1.25, 1.18, False), (1.25, 1.00, True), (6.0, 1.15, True), (1.40, 1.25, False), (3.0, 2.0, True)],
+    ids=["rough", "weak", "strong", "rough above the noise", "not met: for others to judge"],
+)
+def test_what_takes_less_than_half_of_the_rest_is_not_named(base, after, named):
+    best = trial("backlash", after, base=base)
+    state = _State(best.result, [(best, [best], [best], None)], {}, 0.0, 0.0)
+    found = _too_little(state, SimpleNamespace(chi2_per_sample=base, data_count=COUNT))
+    assert found == (None if named else "backlash")
+    assert _too_little(dataclasses.replace(state, steps=[]), best.result) is None
+    assert chi2_of(best.result) == after * COUNT
+
+
+@pytest.mark.parametrize(
+    ("held", "found", "chi2n", "taken"),
+    [("demagnetized", "negative", 1.01, True), ("demagnetized", "negative", 1.10, False), ("demagnetized", "positive", 0.98, False),
+     ("demagnetized", "positive", 0.90, True)],
+    ids=["as good", "worse", "hardly better", "better"],
+)  # fmt: skip
+def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, held, found, chi2n, taken):
+    import fitting.diagnose as module
+    from fitting.setup import Choices
+    from magjax.bench import load_bench
+
+    best = trial("second_mode", 1.0)
+    best.result.estimates, best.result.actuator = (), None
+    other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
+    monkeypatch.setattr(module, "fit", lambda *a, choices, **k: other if choices.rest == "auto" else pytest.fail("not asked"))
+    again = []
+    monkeypatch.setattr(module, "try_effect", lambda *a: again.append(a[5].rest) or best)
+    bench = load_bench("aa-050h")
+    assert bench.start == "auto"
+    *_, chosen = module._finer(None, bench, None, best, [best], Choices(rest=held), 1.0, None)
+    assert chosen.rest == (found if taken else held) and again == ([found] if taken else [])
+    fixed = module._finer(None, bench, None, best, [best], Choices(rest=held), 1.0, None, any_rest=False)
+    assert fixed[2].rest == held
