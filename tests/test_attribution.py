@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of
-from fitting.diagnose import _State, _too_little
 from fitting.screen import Candidate
+from fitting.search import Reached
+from fitting.verdict import too_little
 
 COUNT = 700
 
@@ -73,10 +74,10 @@ def test_confidence_falls_with_rivals_and_with_what_is_left():
 )
 def test_what_takes_less_than_half_of_the_rest_is_not_named(base, after, named):
     best = trial("backlash", after, base=base)
-    state = _State(best.result, [(best, [best], [best], None)], {}, 0.0, 0.0)
-    found = _too_little(state, SimpleNamespace(chi2_per_sample=base, data_count=COUNT))
+    state = Reached(best.result, [(best, [best], [best], None)], {})
+    found = too_little(state, SimpleNamespace(chi2_per_sample=base, data_count=COUNT))
     assert found == (None if named else "backlash")
-    assert _too_little(dataclasses.replace(state, steps=[]), best.result) is None
+    assert too_little(dataclasses.replace(state, steps=[]), best.result) is None
     assert chi2_of(best.result) == after * COUNT
 
 
@@ -87,7 +88,7 @@ def test_what_takes_less_than_half_of_the_rest_is_not_named(base, after, named):
     ids=["as good", "worse", "hardly better", "better"],
 )  # fmt: skip
 def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, held, found, chi2n, taken):
-    import fitting.diagnose as module
+    import fitting.search as module
     from fitting.setup import Choices
     from magjax.bench import load_bench
 

@@ -1,0 +1,149 @@
+"""The search: leaders of the screening are fitted for real, the best is adopted while it earns its place, and screened again.
+
+Forward, then backward: an effect adopted early that later ones have made needless is dropped.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from magjax.effects import CATALOGUE
+
+from .attribute import (
+    BIC_DROP,
+    CLOSE,
+    MIN_DROP,
+    SETTLED_CHI2,
+    STRUCTURES,
+    TIE,
+    WEAK_TIE,
+    chi2_of,
+    family,
+    leaders,
+    rivals_of,
+    try_effect,
+)
+from .check import check_errors
+from .fit import REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER, fit
+from .screen import screen
+from .verdict import SILENT_CHI2, Z_THRESHOLD
+
+MAX_EFFECTS = 3
+SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
+
+
+def screened(result, choices) -> list:
+    """Every effect that may be asked for, best first."""
+    return [c for c in screen(result.problem, result.refined) if c.name not in choices.without]
+
+
+@dataclasses.dataclass
+class Reached:
+    """The current fit, adopted trials with their rivals, all trials of the last round."""
+
+    current: object
+    steps: list
+    tried: dict
+
+
+def search(recordings, bench, base, candidates, choices, progress, check=()) -> Reached:
+    """Forward: fit the leaders from scratch, adopt the best while it earns its place; then screen again."""
+    say = progress or (lambda *a: None)
+    classes = {c.name: c for c in CATALOGUE}
+    count = base.data_count
+    state = Reached(base, [], {})
+    chosen = base.choices  # the density chosen for the base may be finer than the default: rivals get the same
+    for _round in range(MAX_EFFECTS):
+        top = leaders(candidates)
+        calm = state.steps and state.current.chi2_per_sample < SILENT_CHI2
+        if not top or abs(top[0].z) < (SECOND_Z if calm else Z_THRESHOLD):
+            break
+        excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
+        trials = []
+
+        def attempt(c, trials=trials, excess=excess, chosen=chosen):
+            say(f"trying {c.name}", 0, state.current.chi2_per_sample)
+            reached = min((chi2_of(t.result) for t in trials if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
+            trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress, bool(state.steps), reached)
+            trials.append(trial)
+            state.tried[c.name] = trial.candidate
+
+        for c in top:
+            settled = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
+            if settled and c.name not in STRUCTURES and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
+                continue
+            attempt(c)
+        first = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
+        for c in family(first.candidate, candidates, {t.name for t in trials}) if first else ():
+            attempt(c)
+        good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
+        if not good:
+            break
+        best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
+        if state.steps and best.drop < 0.5 * excess and chi2_of(state.current) / count > 1.3 and best.drop < 0.3 * excess:
+            break
+        if state.steps and check and _predicts_worse(state.current.actuator, best.result.actuator, check, bench):
+            break
+        best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress, choices.rest == "auto")
+        state.steps.append((best, rivals_of(best, good), good, state.current))
+        state.current = best.result
+        candidates = screened(best.result, choices)
+        jax.clear_caches()  # programs of trials that are not needed again
+    _backward(recordings, bench, state, chosen, count, progress)
+    return state
+
+
+def _predicts_worse(before, after, check, bench) -> bool:
+    """Does a further effect raise the error on check recordings, taken together in units of their noise?"""
+    rows = check_errors(before, after, check, bench)
+    old, new = (sum((r[k] / (r["noise_rms"] or r["rms_before"])) ** 2 for r in rows) for k in ("rms_before", "rms_after"))
+    return new > 1.02 * old
+
+
+def _backward(recordings, bench, state, chosen, count, progress):
+    """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open.
+
+    The form error of a right effect looks like another effect until the rest is in place.
+    """
+    say = progress or (lambda *a: None)
+    for step in state.steps[:-1][::-1]:
+        name = step[0].name
+        actuator = state.current.actuator
+        if name not in {e.name for e in actuator.effects}:
+            continue
+        say(f"without {name}", 0, state.current.chi2_per_sample)
+        fewer = actuator.without_effect(name)
+        held = tuple(f"effects.{e.name}.{p}" for e in fewer.effects for p in e.parameters())
+        trial = fit(recordings, bench, actuator=fewer, extra=held, choices=chosen, refine=False, progress=progress)
+        rise = chi2_of(trial) - chi2_of(state.current)
+        if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
+            state.steps.remove(step)
+            state.current = trial
+
+
+def _finer(recordings, bench, current, best, good, chosen, excess, progress, any_rest: bool = True):
+    """The best with another start memory and with a finer density where it still leaves something: both were chosen under
+    the misfit of the base. Where that changes them, the near rivals are tried again on the same.
+
+    Start memories that serve as well foretell other mean levels: the one that is tried first stands unless another is
+    better by MIN_DROP.
+    """
+    names = tuple(e.name for e in best.result.estimates if e.name.startswith("effects."))
+    found = chosen
+    later = chosen.rest != RESTS_IN_ORDER[0]
+    if any_rest and bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
+        free = dataclasses.replace(chosen, rest="auto")
+        other = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=free, refine=False, progress=progress)
+        margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
+        if chi2_of(other) < chi2_of(best.result) + margin:
+            found = other.choices
+    if chosen.knots is not None and REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BETWEEN[1]:
+        found = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=found, refine=True, progress=progress).choices
+    if found == chosen:
+        return best, good, chosen
+    classes = {c.name: c for c in CATALOGUE}
+    near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
+    again = [try_effect(recordings, bench, current, t.candidate, classes[t.name], found, excess, progress) for t in near]
+    again = [t for t in again if t.physical] or [best]
+    return min(again, key=lambda t: t.bic_change), again, found

@@ -1,0 +1,267 @@
+"""The verdict: what the search has reached, in one of six words and two or three plain sentences.
+
+Order: what no repair meets is `unknown_at`; a repair that foretells every check recording worse is not named; where nothing
+earned its place the diagnosis is silent; what has rivals is a group, with the recording that tells them apart; the rest is
+attributed. Data problems are told before any of this (`floors`).
+"""
+
+import dataclasses
+
+import numpy as np
+
+from magjax.effects import CATALOGUE
+
+from .attribute import MISFIT, confidence
+from .check import check_errors
+from .experiments import INSTRUMENTS, instrument_request, next_experiment
+from .instruments import exchange
+
+SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
+Z_THRESHOLD = 5.5  # about forty columns are looked at
+HALF = 0.5  # of the excess over NULL_CHI2 must be taken where the repair all but meets the noise
+NULL_CHI2 = 0.95
+ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
+FULL_SHARE = 0.96
+FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """The verdict with everything behind it; str() is the message."""
+
+    verdict: str
+    message: str
+    effects: tuple = ()
+    groups: tuple = ()
+    absorbed: tuple = ()
+    unknown: dict | None = None
+    data_problem: str | None = None
+    candidates: tuple = ()
+    floors: dict = dataclasses.field(default_factory=dict)
+    where: dict = dataclasses.field(default_factory=dict)
+    check: tuple = ()
+    next_experiment: dict | None = None
+    base: object = None
+    repaired: object = None
+    placebo: dict | None = None
+
+    def __str__(self):
+        return f"{self.verdict}: {self.message}"
+
+    def as_dict(self) -> dict:
+        """The content of diagnosis.json."""
+        ranked = [
+            {
+                "name": c.name, "z": c.z, "visibility": c.visibility, "amplitude": c.amplitude,
+                "predicted_chi2_drop": c.predicted_chi2_drop, "achieved_chi2_drop": c.achieved_chi2_drop,
+                "bic_change": c.bic_change, "smallest_visible": c.smallest_visible,
+            }
+            for c in self.candidates
+        ]  # fmt: skip
+        return {
+            "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
+            "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
+            "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
+            "placebo": self.placebo, "message": self.message, "base": self.base.as_dict() if self.base else None,
+            "repaired": self.repaired.as_dict() if self.repaired else None,
+        }  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """What a verdict is read from.
+
+    `reached`: what the search has (`search.Reached`); `adopted`: record-level effects, each with its rivals; `raw`: the plain
+    fit of the readings as they came, `plain`: that of the readings without record-level signals (the same where there are
+    none); `candidates`: the scores beside `plain`; `checks`: the check recordings as they came, and without those signals;
+    `floors`, `where`, `absorbed`: as in `Diagnosis`.
+    """
+
+    reached: object
+    adopted: tuple
+    raw: object
+    plain: object
+    candidates: tuple
+    recordings: tuple
+    bench: object
+    checks: tuple
+    floors: dict
+    where: dict
+    absorbed: tuple
+
+    @property
+    def excess(self) -> float:
+        """chi2/N of what was reached."""
+        return self.reached.current.chi2_per_sample
+
+    @property
+    def missing(self) -> bool:
+        """Whether that is above the noise."""
+        return self.excess > least_excess(self.plain)
+
+    @property
+    def share(self) -> float:
+        """Of the plain fit's misfit, what the repair explains."""
+        before = self.plain.chi2_per_sample
+        return 1 - max(self.excess - 1, 0) / max(before - 1, 1e-9) if before > SILENT_CHI2 else 1.0
+
+    @property
+    def command_only(self) -> bool:
+        """Whether the current that drives the model is a command nobody measured."""
+        measured = all(r.origin.get("metadata", {}).get("current") == "measured" for r in self.recordings)
+        return self.bench.drive == "current" and not measured
+
+
+def least_excess(result) -> float:
+    """chi2/N above which a fit is not at its noise."""
+    return SILENT_CHI2 + 3 * np.sqrt(2 / result.data_count)
+
+
+def too_little(reached, plain) -> str | None:
+    """The names of effects that all but meet the noise and take less than half of what the plain fit leaves above it.
+
+    What a rough density leaves looks like a weak effect, but no effect takes it up.
+    """
+    if not reached.steps or not reached.current.chi2_per_sample < least_excess(plain):
+        return None
+    taken = plain.chi2_per_sample - reached.current.chi2_per_sample
+    if taken > HALF * (plain.chi2_per_sample - NULL_CHI2):
+        return None
+    return " and ".join(best.name for best, *_ in reached.steps)
+
+
+def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
+    """The `Diagnosis`. `rough`: what is left has been looked for and is put down to the density."""
+    tried = evidence.reached.tried
+    dropped = too_little(evidence.reached, evidence.plain)
+    if dropped:
+        evidence = dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, current=evidence.plain, steps=[]))
+    steps, current = evidence.reached.steps, evidence.reached.current
+    raw, clean = evidence.checks
+    rows = tuple(check_errors(evidence.raw.actuator, current.actuator, raw, evidence.bench, clean)) if raw else ()
+    common = {
+        "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
+        "candidates": tuple(tried.get(c.name, c) for c in evidence.candidates), "repaired": current if steps or evidence.adopted else None,
+    }  # fmt: skip
+    if evidence.missing and not rough and (not steps or evidence.share < FULL_SHARE or evidence.excess > FAR_FROM_NOISE):
+        return _unknown(evidence, common)
+    worse = [r for r in rows if r["rms_after"] > 1.05 * r["rms_before"] and r["rms_after"] > 1.3 * r["noise_rms"]]
+    if steps and rows and len(worse) == len(rows):  # a repair that predicts nothing better is not physics
+        return _unknown(evidence, common, " The repair that fits best predicts every check recording worse, so it is not named.")
+    effects, groups, rivals = _found(evidence)
+    if not effects and not groups:
+        return _silent(evidence, common, dropped, rough)
+    swap = exchange(current, evidence.bench)
+    if swap and swap[1] and not any("sensor_lag" in g for g in groups):
+        effects = [e for e in effects if e["name"] != "sensor_lag"]
+        groups.append(["sensor_lag", "second_mode"])
+    asked = instrument_request({"source", "sensor"} if evidence.command_only else {"sensor"}) if swap else None
+    if groups:
+        return _grouped(evidence, common, effects, groups, rivals, swap, asked)
+    return _attributed(evidence, common, effects, swap, asked)
+
+
+def _found(evidence):
+    """Effects that stand alone (rows), groups (names), and the trials of the last group."""
+    effects, groups, last = [], [], []
+    for effect, rivals in evidence.adopted:
+        if rivals:
+            groups.append([effect.name, *[r.name for r in rivals]])
+        else:
+            effects.append(_record_row(effect))
+    for best, rivals, good, previous in evidence.reached.steps:
+        if len(rivals) > 1:
+            groups.append([t.name for t in rivals])
+            last = rivals
+        else:
+            effects.append(_effect_row(best, good, previous, evidence.reached.current))
+    return effects, groups, last
+
+
+def _silent(evidence, common, dropped, rough) -> Diagnosis:
+    text = f"nothing is missing: chi2/N = {evidence.excess:.2f} and "
+    if dropped:
+        text += f"{dropped}, which serves best, takes less than half of what is above the noise."
+    else:
+        best = evidence.candidates[0] if evidence.candidates else None
+        highest = f"{best.name}, z = {best.z:.1f}" if best else "none"
+        text += f"no effect of the catalogue scores above {Z_THRESHOLD} (highest: {highest})."
+    if rough:
+        text += " What is left above the noise follows no smooth function of the signals either: a density rougher than the fit's, most likely."
+    if evidence.absorbed:
+        text += f" These recordings could not show {', '.join(evidence.absorbed)}: the density absorbs them."
+    return Diagnosis("nothing_missing", text, **common)
+
+
+def _grouped(evidence, common, effects, groups, rivals, swap, asked) -> Diagnosis:
+    blocks = {t.candidate.block for t in rivals}
+    between = bool(blocks & set(INSTRUMENTS)) and not blocks <= set(INSTRUMENTS)
+    # where the noise is not met beside one instrument, the other is in question too
+    also = INSTRUMENTS if between and evidence.excess > MISFIT and evidence.command_only else ()
+    experiment = asked or (next_experiment(rivals, evidence.raw.spectra, evidence.bench, also) if rivals else None)
+    names = "; ".join(" or ".join(g) for g in groups)
+    text = f"something is missing that these recordings cannot tell apart: {names}."
+    if effects:
+        text += f" Found beside it: {', '.join(e['name'] for e in effects)}."
+    if swap:
+        text += f" {swap[0]} {_fall(evidence)}."
+    elif between:
+        text += " Instruments and actuator are not told apart by these channels."
+    if experiment:
+        text += f" Next: {experiment['text']}."
+    return Diagnosis("group", text, tuple(effects), tuple(groups), next_experiment=experiment, **common)
+
+
+def _attributed(evidence, common, effects, swap, asked) -> Diagnosis:
+    named = " and ".join(f"{e['name']} ({e['block']})" for e in effects)
+    better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in common["check"])
+    text = f"{named} {'was' if len(effects) == 1 else 'were'} left out: {_fall(evidence)}."
+    text += f" On check recordings: {better}." if better else " Record a check at another frequency to confirm it."
+    if swap:
+        text += f" {swap[0]} To tell: {asked['text']}."
+    return Diagnosis("attributed", text, tuple(effects), next_experiment=asked, **common)
+
+
+def _fall(evidence) -> str:
+    """What the repair does to the misfit, in words."""
+    before, after = evidence.raw.chi2_per_sample, evidence.excess
+    if not evidence.reached.steps:
+        return f"it stands between the harmonics, and without it chi2/N is {after:.2f}"
+    return f"chi2/N falls from {before:.3g} to {after:.2f}"
+
+
+def _unknown(evidence, common, note: str = "") -> Diagnosis:
+    blocks, fields = evidence.where["by_block"], evidence.where["by_field"]
+    block = max(blocks, key=blocks.get) if blocks else "hysteresis"
+    region = f"field quarter {int(np.argmax(fields)) + 1} of 4" if fields else ""
+    steps = evidence.reached.steps
+    best = steps[0][0].name if steps else (common["candidates"][0].name if common["candidates"] else "none")
+    text = (
+        f"something is missing that no effect of the catalogue explains (chi2/N = {evidence.excess:.3g} at best; {best} comes nearest and explains "
+        f"{max(evidence.share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."
+    )
+    unknown = {"block": block, "region": region, "explained_share": float(np.clip(evidence.share, 0, 1))}
+    return Diagnosis("unknown_at", text + note, unknown=unknown, **common)
+
+
+def _effect_row(trial, tried, previous, final) -> dict:
+    result = final if any(e.name == trial.name for e in final.actuator.effects) else trial.result
+    prefix = f"effects.{trial.name}."
+    parameters = {
+        e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit} for e in result.estimates if e.name.startswith(prefix)
+    }
+    shifts = {e.name: [e.value, result.estimate(e.name).value] for e in previous.estimates if e.free and not e.name.startswith("effects.")}
+    return {
+        "name": trial.name, "block": trial.candidate.block, "parameters": parameters,
+        "confidence": confidence(trial, tried), "shifts": shifts,
+    }  # fmt: skip
+
+
+def _record_row(effect) -> dict:
+    kind = {c.name: c for c in CATALOGUE}[effect.name]
+    info = kind.parameters()[kind.amplitude]
+    return {
+        "name": effect.name, "block": kind.block,
+        "parameters": {kind.amplitude: {"value": effect.amplitude, "stderr": effect.stderr, "unit": info.unit}},
+        "confidence": float(np.clip(1 - np.exp(-abs(effect.z) / 4), 0, 0.99)), "shifts": {},
+    }  # fmt: skip
