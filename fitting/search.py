@@ -14,6 +14,7 @@ from .attribute import (
     BIC_DROP,
     CLOSE,
     MIN_DROP,
+    MISFIT,
     SETTLED_CHI2,
     STRUCTURES,
     TIE,
@@ -30,6 +31,7 @@ from .screen import screen
 from .verdict import SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
+LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
 
@@ -81,7 +83,7 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         if not good:
             break
         best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
-        if state.steps and best.drop < 0.5 * excess and chi2_of(state.current) / count > 1.3 and best.drop < 0.3 * excess:
+        if state.steps and best.drop < LEAST_SHARE * excess and chi2_of(state.current) > MISFIT * count:
             break
         if state.steps and check and _predicts_worse(state.current.actuator, best.result.actuator, check, bench):
             break
