@@ -139,6 +139,7 @@ def chosen_places(places) -> list[Place]:
 def learn(base, recordings, bench, progress=None) -> Learned | None:
     """The term that serves best beside a fit, or None where none foretells left-out recordings better."""
     say = progress or (lambda *a: None)
+    jax.clear_caches()  # programs of the search
     places = [p for p in locate_places(base, say) if p.evidence > 0]
     if not places:
         return None

@@ -31,6 +31,7 @@ from .screen import screen
 from .verdict import SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
+PROGRAMS_KEPT = 4  # trials between which compiled programs are let go
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
@@ -70,6 +71,8 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
             trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress, bool(state.steps), reached)
             trials.append(trial)
             state.tried[c.name] = trial.candidate
+            if len(trials) % PROGRAMS_KEPT == 0:
+                jax.clear_caches()  # programs of trials that are not needed again: some hundred megabytes each
 
         for c in top:
             settled = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
@@ -91,7 +94,7 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
         candidates = screened(best.result, choices)
-        jax.clear_caches()  # programs of trials that are not needed again
+        jax.clear_caches()
     _backward(recordings, bench, state, chosen, count, progress)
     return state
 
