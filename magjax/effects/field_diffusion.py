@@ -9,6 +9,7 @@ from .lags import lagged, repeated
 
 SHARES = (0.692, 0.131, 0.053, 0.124)  # 4/j0n^2 of the roots of J0, the rest lumped
 RATES = (1.0, 5.27, 12.95, 30.0)  # (j0n/j01)^2
+KNEE = 0.9  # share from which it bends towards 1: beyond 1 the field would run ahead of the flux and no step has a solution
 
 
 class FieldDiffusion(AbstractEffect):
@@ -36,8 +37,10 @@ class FieldDiffusion(AbstractEffect):
 
     def field_shift(self, trial, state, actuator):
         """What the lags lack of dB/dt, times k and kappa, A/m."""
+        size = jnp.abs(self.kappa)
+        share = jnp.where(size < KNEE, self.kappa, jnp.sign(self.kappa) * (KNEE + (1 - KNEE) * jnp.tanh((size - KNEE) / (1 - KNEE))))
         late = sum(g * (x - trial.flux_rate) for g, x in zip(SHARES, self._lags(trial, state), strict=True))
-        return self.kappa * actuator.coil.loss * late
+        return share * actuator.coil.loss * late
 
     def advance(self, trial, state, actuator):
         """The lags after the step."""
