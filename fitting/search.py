@@ -28,9 +28,10 @@ from .attribute import (
 from .check import check_errors
 from .fit import REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER, fit
 from .screen import screen
-from .verdict import SILENT_CHI2, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
+HOPELESS = 2.0  # times what a repair may leave, after two effects
 PROGRAMS_KEPT = 4  # trials between which compiled programs are let go
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
@@ -61,6 +62,8 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         top = leaders(candidates)
         calm = state.steps and state.current.chi2_per_sample < SILENT_CHI2
         if not top or abs(top[0].z) < (SECOND_Z if calm else Z_THRESHOLD):
+            break
+        if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
         excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
         trials = []
@@ -95,7 +98,8 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         state.current = best.result
         candidates = screened(best.result, choices)
         jax.clear_caches()
-    _backward(recordings, bench, state, chosen, count, progress)
+    if state.current.chi2_per_sample < FAR_FROM_NOISE:
+        _backward(recordings, bench, state, chosen, count, progress)
     return state
 
 
