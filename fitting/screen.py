@@ -20,13 +20,12 @@ from magjax.effects import CATALOGUE
 from magjax.simulate import finish_chain
 
 from .joint import data_jacobian, data_residual
-from .model import whitened
+from .model import predicted_lines, whitened
 from .uncertainty import UNDERSMOOTH
 
 SHAPE_GRIDS = {
     "amplifier_lag": {"order2": (0.25,)},
     "excess_loss": {"rate_knee": (0.3, 10.0, 100.0)},
-    "field_diffusion": {"tau": (5e-5, 2e-4, 8e-4, 3e-3)},
     "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3), "air": (0.05, 0.9)},
     "magnetic_aftereffect": {"of_field": (0.05, 0.9)},
     "rate_dependent_switching": {"rate0": (1e3, 3e4, 1e6), "of_flux": (0.05, 0.9)},
@@ -208,7 +207,7 @@ def columns(problem, z):
     if late:
         lines = _late_columns(predictor, actuator, states, tuple(c(**shapes) for c, shapes in late))
         found += [(c, shapes, line) for (c, shapes), line in zip(late, lines, strict=True)]
-    marching = [(c, shapes) for c in classes if c.in_step for shapes in shape_grid(c)]
+    marching = [(c, shapes) for c in classes if c.in_step and not c.shells for shapes in shape_grid(c)]
     drives = [np.asarray(d) for d in predictor.drives]
     sources = [
         (c, shapes) for c in classes if c.block == "source" for shapes in (c.finite_trials(drives, predictor.steps) or shape_grid(c))
@@ -225,6 +224,9 @@ def columns(problem, z):
             rows.append((still, tuple(_drive_change(c(**shapes), d, t, actuator, finite) for d, t in grids)))
         lines = _march_columns(predictor, actuator, jax.tree.map(lambda *x: jnp.stack(x), *rows))
         found += [(c, s, line) for (c, s), line in zip(marching + sources, lines, strict=True)]
+    for c in classes:
+        for shapes in c.finite_trials(drives, predictor.steps) if c.shells else ():
+            found.append((c, shapes, predicted_lines(predictor, actuator.with_effect(c(**shapes))) - predicted_lines(predictor, actuator)))
     zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
     return [(c, s, np.asarray(whitened(line, zero))) for c, s, line in found]
 

@@ -21,7 +21,7 @@ CASES = [
     ("quartic_magnetostriction", {"b": 0.05}, True),
     ("delta_e", {"e": 0.1}, False),
     ("second_mode", {"gain": 0.006, "f2": 800.0, "xi2": 0.05}, True),
-    ("field_diffusion", {"kappa": 0.5, "tau": 4e-4}, False),
+    ("field_diffusion", {"kappa": 0.5}, False),
     ("creep", {"gain": 0.004}, False),
     ("backlash", {"gap": 9e-8}, True),
     ("duffing_stiffness", {"k3": 0.03}, True),

@@ -109,7 +109,6 @@ def test_smooth_friction_approaches_coulomb():
         effects.SecondEddyPath(kappa=0.05, tau=1e-2, air=1.0),
         effects.MagneticAftereffect(share=0.1, of_field=0.0),
         effects.MagneticAftereffect(share=0.1, of_field=1.0),
-        effects.FieldDiffusion(kappa=1.0, tau=3e-2),
     ],
     ids=lambda e: e.name,
 )

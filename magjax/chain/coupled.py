@@ -147,6 +147,11 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
     """
     if scheme not in SCHEMES:
         raise ConfigurationError(f'scheme = "{scheme}" is unknown; write one of {", ".join(SCHEMES)}')
+    for effect in actuator.effects:
+        if effect.shells:
+            from .shells import march_shells  # which is built on this module
+
+            return march_shells(actuator, effect.share(), effect.shells, applied, current, h, memory, scheme, disturbance, period)
     table = actuator.hysteresis.table()
     effects = tuple(e for e in actuator.effects if e.in_step)
     a = MU0 * actuator.coil.loss / h

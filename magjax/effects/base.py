@@ -41,7 +41,7 @@ class AbstractEffect(eqx.Module):
     `name`, `block` (one of chain.BLOCKS), `law` (the equation), `source` (literature), `signature` (how it shows in
     data), `in_step` (solved inside the step of (4)), `slow` (its state takes longer than
     a few periods: `settled` leads it to where it repeats), `record_level` (acts on the whole record, not period by period),
-    `amplitude` (the parameter whose null removes the effect).
+    `amplitude` (the parameter whose null removes the effect), `shells` (into so many the rod is cut, see chain.shells; 0: not).
     """
 
     name: ClassVar[str] = ""
@@ -53,6 +53,7 @@ class AbstractEffect(eqx.Module):
     in_step: ClassVar[bool] = False
     slow: ClassVar[bool] = False
     record_level: ClassVar[bool] = False
+    shells: ClassVar[int] = 0
 
     def with_amplitude(self, value):
         """The same effect with its amplitude parameter replaced."""

@@ -17,6 +17,8 @@ from pathlib import Path
 
 from .cases import SEALS, SUITES, make_case, seal, size, write_case
 
+GENERATOR_FAILED = -2
+
 
 def run_case(suite: str, number: int, out: Path, limit: float = 1200.0) -> dict:
     """done.json of one case, run where it is not there yet; `limit` seconds."""
@@ -26,8 +28,12 @@ def run_case(suite: str, number: int, out: Path, limit: float = 1200.0) -> dict:
     if done.exists():
         return json.loads(done.read_text())
     shutil.rmtree(folder, ignore_errors=True)
-    write_case(case, folder)
-    ended = diagnose(folder, folder / "result", limit)
+    try:
+        write_case(case, folder)
+    except RuntimeError as error:  # the generator's own failure is told, and the suite goes on
+        ended = {"status": GENERATOR_FAILED, "seconds": 0.0, "peak_MB_so_far": 0, "last": str(error)}
+    else:
+        ended = diagnose(folder, folder / "result", limit)
     part = folder / "done.part"
     part.write_text(json.dumps({"name": case.name, **ended}))
     part.replace(done)

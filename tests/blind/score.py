@@ -16,6 +16,7 @@ import numpy as np
 
 from .cases import SUITES, block_outside, make_case, seal, size
 from .oracle import FILE as ORACLE
+from .run import GENERATOR_FAILED
 from .strengths import GROUPS
 
 ORDER = ("right", "group", "kin", "extra", "partly", "silent", "unknown", "data_problem", "wrong", "failed")
@@ -83,7 +84,9 @@ def read(suite: str, out: Path):
         folder = Path(out) / case.name
         if (folder / "done.json").exists():
             path = folder / "result" / "diagnosis.json"
-            yield case, json.loads(path.read_text()) if path.exists() else None, json.loads((folder / "done.json").read_text())
+            done = json.loads((folder / "done.json").read_text())
+            if done["status"] != GENERATOR_FAILED:  # a bench that could not be made says nothing
+                yield case, json.loads(path.read_text()) if path.exists() else None, done
 
 
 def gap_closed(diagnosis):

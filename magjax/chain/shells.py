@@ -1,0 +1,166 @@
+"""The coupled step where the field diffuses into the rod: shells with their own field and relays.
+
+A rod cut into S shells of equal area, each with a field v_i and a Preisach operator of its own, all with the same masses.
+By Ampere's and Faraday's laws in a cylinder H_i = applied field - k sum_j D_ij dB_j/dt, with D the mean of
+-2 ln max(u, u') over two shells, u = (r/R)^2; its mean is one, so that the mean lag is that of (4). One step asks for
+    p0 (v_i + shift_i) + loss_i + sum_j Q_ij X_j = rhs_i,   X_j = H_j + M_j,
+    p0 = 1, Q = 3/2 a D / S for the backward formula, p0 = 1/2, Q = a D / S for the trapezoid (a = mu0 k / h):
+the gradient of a strictly convex function of the X_j, piecewise quadratic. It is solved by Newton's method with halved
+steps; one more step with a frozen matrix makes every derivative exact, as in `coupled`.
+Means over the shells go to the blocks behind: what the coil sees and what the rod does as a whole.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.lax import stop_gradient
+
+from ..constants import MU0
+from ..effects.base import Trial
+from ..preisach.memory import apply_field, branch_magnetization
+from .coupled import _ends_of_periods, _extra_terms, _settle, _slope
+
+CLOSE_ENOUGH = 1e-10  # A/m relative to half the plane
+MOST_STEPS = 60
+OVERSHOOT = 0.5  # of the descent at a step's start, that its end may climb
+
+
+def distribution(count: int) -> np.ndarray:
+    """D: field lost in a shell per k dB/dt of another, (count, count), symmetric, of mean 1."""
+    edge = np.arange(count + 1) / count
+    a, b = edge[:-1], edge[1:]
+
+    def log_moment(x):  # integral of ln x
+        return np.where(x > 0, x * np.log(np.maximum(x, 1e-300)), 0.0) - x
+
+    def ramp_moment(x):  # integral of (x - a) ln x
+        half = np.where(x > 0, 0.5 * x * x * np.log(np.maximum(x, 1e-300)), 0.0) - 0.25 * x * x
+        return half - a * log_moment(x)
+
+    outer = -2 * count * (log_moment(b) - log_moment(a))
+    own = -4 * count**2 * (ramp_moment(b) - ramp_moment(a))
+    index = np.arange(count)
+    return np.where(np.eye(count, dtype=bool), own, outer[np.maximum.outer(index, index)])
+
+
+class _Carry(eqx.Module):
+    memory: object  # of every shell
+    X0: jax.Array
+    X_before: jax.Array
+    H0: jax.Array
+    applied0: jax.Array
+    states: tuple
+    marks: tuple
+
+
+def march_shells(actuator, share, count: int, applied, current, h, memory, scheme: str, disturbance=None, period: int = 0):
+    """`coupled.magnetize` for a rod of `count` shells, of whose loss a `share` is distributed as in a solid cylinder."""
+    table = actuator.hysteresis.table()
+    effects = tuple(e for e in actuator.effects if e.in_step and not e.shells)
+    bdf = scheme == "bdf2"
+    a = MU0 * actuator.coil.loss / h
+    D = (1 + share * (distribution(count) - 1)) / count
+    p0, Q = (1.0, 1.5 * a * D) if bdf else (0.5, a * D)
+
+    memory = jax.vmap(lambda _: apply_field(table, memory, applied[0]))(jnp.arange(count))
+    zero = jnp.zeros_like(memory.field)
+    rest = Trial(memory.field, memory.magnetization, zero, zero, current[0], h)
+    states = tuple(jax.tree.map(lambda s: jnp.broadcast_to(s, zero.shape), e.start(rest, actuator)) for e in effects)
+    _, shift, added = _extra_terms(effects, states, actuator, rest, 0.0, 0.0)
+    first = memory.field + shift
+    X = first + memory.magnetization + added
+    carry = _Carry(memory, X, X, first, applied[0], states, states)
+
+    def advance(c: _Carry, drive):
+        applied1, current1, end, *given = drive
+        if bdf:
+            rhs = applied1 + (Q / 1.5) @ (2 * c.X0 - 0.5 * c.X_before)
+        else:
+            rhs = 0.5 * (applied1 + c.applied0 - c.H0) + Q @ c.X0
+        if given:  # p = p0 + q there: what is added to H acts on the loss too
+            rhs = rhs - p0 * given[0] - Q @ (jnp.ones(count) * (given[0] + given[1])) - given[2]
+
+        def trial_of(c, drive1, v, m):
+            X1 = v + m
+            change = (1.5 * X1 - 2 * c.X0 + 0.5 * c.X_before) if bdf else X1 - c.X0
+            return Trial(v, m, MU0 * change / h, (v - c.memory.field) / h, drive1, h)
+
+        v, m, rising, kept = _solve(table, c, effects, actuator, partial(trial_of, drive1=current1), p0, Q, rhs)
+        trial = trial_of(c, current1, v, m)
+        loss, shift, added = _extra_terms(effects, c.states, actuator, trial, 0.0, 0.0)
+        H, M = v + shift, m + added
+        residual = p0 * H + loss + Q @ (H + M) - rhs
+        residual = residual + (_relays(table, c.memory, v)[0] - m)  # the relays' own M there: a step that did not settle shows
+        moved = jax.vmap(lambda s, r, k, x, y: s.move(r, k, x, y))(c.memory, rising, kept, v, m)
+        states = tuple(e.advance(trial, s, actuator) for e, s in zip(effects, c.states, strict=True))
+        states, marks = _settle(effects, states, c.marks, end, period * h)
+        if given:
+            H, M = H + given[0], M + given[1]
+        row = (H.mean(), M.mean(), v.mean(), residual[jnp.argmax(jnp.abs(residual))])
+        return _Carry(moved, H + M, c.X0, H, applied1, states, marks), row
+
+    ends = _ends_of_periods(len(applied), period)
+    carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:], ends, *(d[1:] for d in disturbance or ())))
+    rows = ((first, H), (rest.magnetization + added, M), (rest.field, v), (zero, residual))
+    H, M, v, residual = (jnp.concatenate([jnp.reshape(x.mean(), (1,)), y]) for x, y in rows)
+    return H, M, v, residual, carry.memory.overflow.any()
+
+
+def _relays(table, memory, v):
+    """Branch and magnetization of every shell at fields v: (M, dM/dv, rising, kept)."""
+
+    def one(memory, v):
+        rising, kept, threshold, m_there = memory.branch(table, v)
+        return branch_magnetization(table, rising, threshold, m_there, v), _slope(table, v, threshold, rising), rising, kept
+
+    return jax.vmap(one)(memory, v)
+
+
+def _solve(table, c, effects, actuator, trial_of, p0, Q, rhs):
+    """Fields and magnetizations of all shells, with exact derivatives, and their branches."""
+    fixed = stop_gradient((table, c, effects, actuator, Q, rhs, trial_of.keywords["drive1"]))
+
+    def misfit(v):
+        table, c, effects, actuator, Q, rhs, drive1 = fixed
+        m, slope, *_ = _relays(table, c.memory, v)
+
+        def terms(v, m):
+            return _extra_terms(effects, c.states, actuator, trial_of.func(c, drive1, v, m), 0.0, 0.0)
+
+        (loss, shift, added), (d_loss, d_shift, d_added) = jax.jvp(terms, (v, m), (jnp.ones_like(v), slope))
+        F = p0 * (v + shift) + loss + Q @ (v + shift + m + added) - rhs
+        rise = 1 + d_shift + slope + d_added  # dX/dv
+        return F, jnp.diag(p0 * (1 + d_shift) + d_loss) + Q * rise, rise
+
+    def refine(walk):
+        v, step, descent, scale, _, number = walk
+        F, J, rise = misfit(v + scale * step)
+        along = jnp.sum(F * rise * step)  # of the potential whose gradient F is: above zero the minimum was passed
+        good = (along <= OVERSHOOT * descent) | (scale < 1e-6)
+        v = jnp.where(good, v + scale * step, v)
+        fresh = -jnp.linalg.solve(J, F)
+        step, descent = jnp.where(good, fresh, step), jnp.where(good, -jnp.sum(F * rise * fresh), descent)
+        return v, step, descent, jnp.where(good, 1.0, 0.5 * scale), jnp.where(good, jnp.max(jnp.abs(F)), jnp.inf), number + 1
+
+    reach = 0.5 * fixed[0].step * fixed[0].cells
+    start = fixed[1].memory.field
+
+    def unsettled(walk):
+        return (walk[4] > CLOSE_ENOUGH * reach) & (walk[5] < MOST_STEPS)
+
+    walk = (start, jnp.zeros_like(start), jnp.zeros(()), jnp.ones(()), jnp.full((), jnp.inf), 0)
+    v = stop_gradient(jax.lax.while_loop(unsettled, refine, walk)[0])
+    inverse = stop_gradient(jnp.linalg.inv(misfit(v)[1]))
+    _, slope, rising, kept = stop_gradient(_relays(fixed[0], fixed[1].memory, v))
+
+    def live(memory, rising, kept, v):
+        _, _, threshold, m_there = memory.select(table, rising, kept)
+        return branch_magnetization(table, rising, threshold, m_there, v)
+
+    m = jax.vmap(live)(c.memory, rising, kept, v)
+    loss, shift, added = _extra_terms(effects, c.states, actuator, trial_of(c, v=v, m=m), 0.0, 0.0)
+    change = -inverse @ (p0 * (v + shift) + loss + Q @ (v + shift + m + added) - rhs)
+    return v + change, m + slope * change, rising, kept

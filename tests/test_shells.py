@@ -1,0 +1,121 @@
+"""The rod in shells: its matrix, its step against a slow solver, its agreement with the plain step where all shells are alike."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import dblquad
+from scipy.optimize import root
+
+import magjax.effects as effects
+from magjax.chain.coupled import magnetize
+from magjax.chain.shells import distribution, march_shells
+from magjax.constants import MU0
+from magjax.preisach.memory import apply_field
+from magjax.simulate import run_chain, simulate
+from tests.test_simulate import actuator, sine
+
+N, DT = 100, 1 / (200 * 100)
+CURRENT = jnp.asarray(np.append(sine(N, 0.7), sine(N, 0.7)[:40]))
+
+
+def test_the_matrix_is_that_of_a_cylinder():
+    for count in (1, 3, 4):
+        D = distribution(count)
+        assert D.mean() == pytest.approx(1.0, abs=1e-14) and np.array_equal(D, D.T) and np.linalg.eigvalsh(D).min() > 0
+    D = distribution(3)
+    for i, j in ((0, 0), (0, 2), (1, 1), (2, 1)):
+        box = (i / 3, (i + 1) / 3, j / 3, (j + 1) / 3)
+        whole = dblquad(lambda y, x: -2 * np.log(max(x, y, 1e-300)), *box, epsabs=1e-5)[0]
+        assert D[i, j] == pytest.approx(9 * whole, abs=2e-3)
+
+
+@pytest.mark.parametrize("scheme", ["bdf2", "trapezoid"])
+@pytest.mark.parametrize(
+    "extra",
+    [(), (effects.ExcessLoss(k=20.0),), (effects.MeanField(alpha=0.01), effects.MagneticAftereffect(share=0.1))],
+    ids=lambda e: "+".join(x.name for x in e) or "alone",
+)
+def test_shells_that_share_one_field_march_as_the_rod_does(scheme, extra):
+    act = actuator(20)
+    for effect in extra:
+        act = act.with_effect(effect)
+    applied, memory = act.coil.applied_field(CURRENT), act.hysteresis.memory(act.hysteresis.table(), 4)
+    given = tuple(s * jnp.sin(jnp.linspace(0, 9, len(CURRENT))) for s in (30.0, 200.0, 50.0))
+    plain = magnetize(act, applied, CURRENT, DT, memory, scheme, given, period=N)
+    cut = march_shells(act, 0.0, 3, applied, CURRENT, DT, memory, scheme, given, period=N)
+    for a, b, name in zip(plain[:3], cut[:3], ("H", "M", "v"), strict=True):
+        assert np.abs(np.asarray(a - b)).max() < 1e-7 * np.ptp(np.asarray(a)), name
+    assert np.abs(np.asarray(cut[3])).max() < 1e-5
+
+
+@pytest.mark.parametrize("scheme", ["bdf2", "trapezoid"])
+def test_every_step_against_a_general_solver(scheme):
+    act, share, count = actuator(20), 0.8, 3
+    applied = np.asarray(act.coil.applied_field(CURRENT))[:60]
+    table = act.hysteresis.table()
+    start = act.hysteresis.memory(table, 4)
+    H, M, _, residual, over = march_shells(act, share, count, jnp.asarray(applied), CURRENT[:60], DT, start, scheme)
+    assert np.abs(np.asarray(residual)).max() < 1e-6 and not over
+    at = jax.jit(jax.vmap(lambda memory, v: apply_field(table, memory, v)))
+    D = (1 + share * (distribution(count) - 1)) * MU0 * float(act.coil.loss) / DT / count
+    memory = at(jax.vmap(lambda _: start)(jnp.arange(count)), jnp.full(count, applied[0]))
+    X = before = np.asarray(memory.field + memory.magnetization)
+    old = np.asarray(memory.field)
+    for n in range(1, 60):
+
+        def misfit(v, n=n, X=X, before=before, old=old, memory=memory):
+            new = v + np.asarray(at(memory, jnp.asarray(v)).magnetization)
+            if scheme == "bdf2":
+                return v + D @ (1.5 * new - 2 * X + 0.5 * before) - applied[n]
+            return 0.5 * (v + old) + D @ (new - X) - 0.5 * (applied[n] + applied[n - 1])
+
+        found = root(misfit, old, method="hybr", options={"xtol": 1e-12}).x
+        memory = at(memory, jnp.asarray(found))
+        X, before, old = found + np.asarray(memory.magnetization), X, found
+        assert float(H[n]) == pytest.approx(found.mean(), abs=1e-5 * np.ptp(applied))
+        assert float(M[n]) == pytest.approx(np.asarray(memory.magnetization).mean(), abs=1e-5 * np.ptp(np.asarray(M)))
+
+
+def test_derivatives_of_the_constants_through_the_shells():
+    act = actuator(20).with_effect(effects.FieldDiffusion(kappa=0.7)).with_effect(effects.MeanField(alpha=0.003))
+    for name, step in (("coil.R_eddy", 1e-3), ("effects.field_diffusion.kappa", 1e-5), ("effects.mean_field.alpha", 1e-7), ("coil.H_bias", 0.1)):
+        value = float(act.parameters()[name][0])
+
+        def reading(x, name=name):
+            return run_chain(act.replace({name: x}), CURRENT[:N], DT, 2, 4, "bdf2").reading
+
+        exact = np.asarray(jax.jvp(reading, (jnp.asarray(value),), (jnp.ones(()),))[1])
+        number = (np.asarray(reading(value + step)) - np.asarray(reading(value - step))) / (2 * step)
+        assert np.abs(exact - number).max() < 1e-4 * np.abs(number).max(), name
+
+
+def test_the_skin_leads_and_slow_drives_do_not_see_it():
+    act = actuator(20)
+    solid = act.with_effect(effects.FieldDiffusion(kappa=1.0))
+    changes = []
+    for f in (2.0, 20.0, 200.0):
+        plain, cut = (np.asarray(simulate(a, CURRENT[:N], 1 / (f * N), periodic=True).magnetization) for a in (act, solid))
+        changes.append(np.abs(cut - plain).max() / np.ptp(plain))
+    assert changes[0] < 1e-3 and changes[0] < 0.1 * changes[1] < 0.1 * changes[2]
+
+
+def test_a_share_beyond_its_range_still_has_steps():
+    for kappa in (-3.0, 1.0, 50.0):
+        signals = run_chain(actuator(20).with_effect(effects.FieldDiffusion(kappa=kappa)), CURRENT[:N], DT, 2, 4)
+        assert np.abs(np.asarray(signals.residual)).max() < 1e-5 and np.isfinite(np.asarray(signals.reading)).all()
+
+
+def test_the_screening_scores_it_at_its_finite_size():
+    from fitting.demo import concealed_actuator, record
+    from fitting.fit import fit
+    from fitting.screen import screen
+    from fitting.setup import Choices
+    from magjax.bench import load_bench
+
+    truth = concealed_actuator(load_bench("aa-050h")).with_effect(effects.FieldDiffusion(kappa=0.6))
+    rng = np.random.default_rng(0)
+    runs = [record(truth, f, a, 0.05, rng, f"{f}") for f, a in ((10, 0.8), (40, 0.4), (100, 0.8), (200, 0.4), (300, 0.8))]
+    found = fit(runs, load_bench("aa-050h"), choices=Choices(fine=250, knots=(12, 9), level=48, rest="negative"), refine=False)
+    best = next(c for c in screen(found.problem, found.refined) if c.name == "field_diffusion")
+    assert best.z > 5 and best.amplitude == 0.5 and not best.shapes
