@@ -10,9 +10,7 @@ import dataclasses
 import numpy as np
 
 from .fit import fit
-from .joint import data_residual
 from .screen import Candidate
-from .setup import build_problem, free_parameters
 
 LEADERS = 6  # families of directions that are tried
 FAMILY = 0.85  # |cos| of two directions that makes a family
@@ -25,8 +23,6 @@ BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
 WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
 SAME_DIRECTION = 0.97
-FAR_START = 20.0  # chi2/N of the plain fit above which the first-order amplitude is not trusted as a start
-START_SHARES = (1.0, 0.5, 0.2)
 MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
 MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart
 
@@ -100,8 +96,6 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     effect = effect_class(**candidate.shapes).with_amplitude(amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale)
     names = tuple(f"effects.{effect.name}.{p}" for p in effect.parameters())
     held = tuple(f"effects.{e.name}.{p}" for e in base.actuator.effects for p in e.parameters())
-    if base.chi2_per_sample > FAR_START:
-        effect = _nearest_start(base, bench, effect, (*held, *names), choices)
     start = base.solution.z[: base.problem.layout.density_unknowns + 1] if warm and choices.knots == base.choices.knots else None
     actuator = base.actuator.with_effect(effect)
     result = fit(recordings, bench, actuator=actuator, extra=(*held, *names), choices=choices, refine=False, progress=progress, start=start, target=target)
@@ -119,21 +113,6 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     extra = len(names) * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
     return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), len(names))
-
-
-def _nearest_start(base, bench, effect, names, choices):
-    """The effect at the amplitude, of the first-order one and smaller ones, from which the recordings are met best.
-
-    Where much is amiss the first-order amplitude overshoots, and a fit that starts too far away gets stuck.
-    """
-    first, best = float(getattr(effect, effect.amplitude)), (np.inf, effect)
-    for share in START_SHARES:
-        trial = effect.with_amplitude(share * first)
-        actuator = base.actuator.with_effect(trial)
-        misfit = data_residual(*build_problem(base.spectra, actuator, bench, free_parameters(bench, actuator, names), choices))
-        if (chi2 := float(misfit @ misfit)) < best[0]:
-            best = (chi2, trial)
-    return best[1]
 
 
 def rivals_of(best: Trial, trials) -> list[Trial]:

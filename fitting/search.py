@@ -19,6 +19,7 @@ from .attribute import (
     STRUCTURES,
     TIE,
     WEAK_TIE,
+    Trial,
     chi2_of,
     family,
     leaders,
@@ -32,6 +33,7 @@ from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
+NEAR_RIVAL, MOST_RIVALS = 0.3, 3  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
 PROGRAMS_KEPT = 4  # trials between which compiled programs are let go
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
@@ -100,6 +102,7 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         jax.clear_caches()
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         _backward(recordings, bench, state, chosen, count, progress)
+        _exchange(recordings, bench, state, chosen, progress)
     return state
 
 
@@ -129,6 +132,29 @@ def _backward(recordings, bench, state, chosen, count, progress):
         if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
             state.steps.remove(step)
             state.current = trial
+
+
+def _exchange(recordings, bench, state, chosen, progress):
+    """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
+    that was not theirs."""
+    classes = {c.name: c for c in CATALOGUE}
+    for index, (best, _, good, previous) in enumerate(state.steps[:-1]):
+        near = [t for t in good if t is not best and t.bic_change < best.bic_change + NEAR_RIVAL * chi2_of(best.result)]
+        if not near or best.name not in {e.name for e in state.current.actuator.effects}:
+            continue
+        rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
+        excess = max(chi2_of(rest), MIN_DROP)
+        own = Trial(best.candidate, state.current, 0.0, best.parameters * np.log(rest.data_count), True, best.explained_share, best.parameters)
+        trials = [own]
+        for t in sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]:
+            trials.append(try_effect(recordings, bench, rest, t.candidate, classes[t.name], chosen, excess, progress))
+        trials = [t for t in trials if t.physical]
+        found = min(trials, key=lambda t: t.bic_change)
+        share = {t.name: t.explained_share for t in good}
+        trials = [dataclasses.replace(t, explained_share=share.get(t.name, t.explained_share)) for t in trials]
+        found = next(t for t in trials if t.name == found.name)
+        state.steps[index] = (found, rivals_of(found, trials), trials, previous)
+        state.current = found.result
 
 
 def _finer(recordings, bench, current, best, good, chosen, excess, progress, any_rest: bool = True):

@@ -33,7 +33,10 @@ def test_the_matrix_is_that_of_a_cylinder():
 @pytest.mark.parametrize("scheme", ["bdf2", "trapezoid"])
 @pytest.mark.parametrize(
     "extra",
-    [(), (effects.ExcessLoss(k=20.0),), (effects.MeanField(alpha=0.01), effects.MagneticAftereffect(share=0.1))],
+    [
+        (), (effects.ExcessLoss(k=20.0),), (effects.MeanField(alpha=0.01), effects.MagneticAftereffect(share=0.1)),
+        (effects.SecondEddyPath(kappa=0.1, tau=1e-3, air=0.5), effects.RateDependentSwitching(gamma=20.0)),
+    ],
     ids=lambda e: "+".join(x.name for x in e) or "alone",
 )
 def test_shells_that_share_one_field_march_as_the_rod_does(scheme, extra):

@@ -68,7 +68,7 @@ def march_shells(actuator, share, count: int, applied, current, h, memory, schem
     memory = jax.vmap(lambda _: apply_field(table, memory, applied[0]))(jnp.arange(count))
     zero = jnp.zeros_like(memory.field)
     rest = Trial(memory.field, memory.magnetization, zero, zero, current[0], h)
-    states = tuple(jax.tree.map(lambda s: jnp.broadcast_to(s, zero.shape), e.start(rest, actuator)) for e in effects)
+    states = _of_every_shell(tuple(e.start(rest, actuator) for e in effects), count)
     _, shift, added = _extra_terms(effects, states, actuator, rest, 0.0, 0.0)
     first = memory.field + shift
     X = first + memory.magnetization + added
@@ -95,7 +95,7 @@ def march_shells(actuator, share, count: int, applied, current, h, memory, schem
         residual = p0 * H + loss + Q @ (H + M) - rhs
         residual = residual + (_relays(table, c.memory, v)[0] - m)  # the relays' own M there: a step that did not settle shows
         moved = jax.vmap(lambda s, r, k, x, y: s.move(r, k, x, y))(c.memory, rising, kept, v, m)
-        states = tuple(e.advance(trial, s, actuator) for e, s in zip(effects, c.states, strict=True))
+        states = _of_every_shell(tuple(e.advance(trial, s, actuator) for e, s in zip(effects, c.states, strict=True)), count)
         states, marks = _settle(effects, states, c.marks, end, period * h)
         if given:
             H, M = H + given[0], M + given[1]
@@ -107,6 +107,11 @@ def march_shells(actuator, share, count: int, applied, current, h, memory, schem
     rows = ((first, H), (rest.magnetization + added, M), (rest.field, v), (zero, residual))
     H, M, v, residual = (jnp.concatenate([jnp.reshape(x.mean(), (1,)), y]) for x, y in rows)
     return H, M, v, residual, carry.memory.overflow.any()
+
+
+def _of_every_shell(states, count):
+    """States of effects, each (shells,): some do not differ between them."""
+    return jax.tree.map(lambda s: jnp.broadcast_to(jnp.asarray(s, float), (count,)), states)
 
 
 def _relays(table, memory, v):
