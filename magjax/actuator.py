@@ -33,9 +33,16 @@ class Actuator(eqx.Module):
     output: str = eqx.field(static=True, default="displacement")
 
     def with_effect(self, effect: AbstractEffect) -> "Actuator":
-        """The same actuator with one more effect; an effect of the same name is replaced."""
-        kept = tuple(e for e in self.effects if e.name != effect.name)
-        return dataclasses.replace(self, effects=(*kept, effect))
+        """The same actuator with one more effect; an effect of the same name is replaced.
+
+        Effects stand in the order of the catalogue, whatever the order in which they are added: within a block each acts on
+        what the one before it leaves. Those that are in no catalogue come last.
+        """
+        from .effects import CATALOGUE
+
+        rank = {c.name: k for k, c in enumerate(CATALOGUE)}
+        kept = [e for e in self.effects if e.name != effect.name]
+        return dataclasses.replace(self, effects=tuple(sorted((*kept, effect), key=lambda e: rank.get(e.name, len(rank)))))
 
     def without_effect(self, name: str) -> "Actuator":
         """The same actuator without the effect of that name."""

@@ -62,6 +62,17 @@ def test_null_gradient_and_batch(kind):
     assert np.asarray(both[1]) == pytest.approx(np.asarray(reading(extended.replace({name: value}), 0.5 * CURRENT)), abs=1e-16, rel=1e-9)
 
 
+def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():
+    pair = (effects.Backlash(gap=3e-7), effects.DuffingStiffness(k3=0.05))
+    one, other = actuator(20), actuator(20)
+    for first, second in zip(pair, pair[::-1], strict=True):
+        one, other = one.with_effect(first), other.with_effect(second)
+    assert [e.name for e in one.effects] == [e.name for e in other.effects] == ["duffing_stiffness", "backlash"]
+    assert np.array_equal(np.asarray(reading(one)), np.asarray(reading(other)))
+    again = one.with_effect(effects.DuffingStiffness(k3=0.1))
+    assert [e.name for e in again.effects] == ["duffing_stiffness", "backlash"] and float(again.effects[0].k3) == 0.1
+
+
 def test_a_limited_voltage_bounds_the_current():
     command = np.asarray(CURRENT)
     effect = effects.AmplifierClipping(inverse_limit=1 / 0.6, tau_L=2e-3)
