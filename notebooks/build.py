@@ -1,4 +1,4 @@
-"""`python notebooks/build.py`: every percent-format source to an .ipynb beside it, run unless --no-run is given."""
+"""`python notebooks/build.py [01 07 ...]`: percent-format sources to an .ipynb beside each, run unless --no-run is given."""
 
 import sys
 from pathlib import Path
@@ -9,8 +9,9 @@ HERE = Path(__file__).parent
 
 
 def main():
-    """Convert all; `--no-run` leaves the outputs out."""
-    for source in sorted(HERE.glob("0*.py")):
+    """Convert all, or those whose numbers are given; `--no-run` leaves the outputs out."""
+    wanted = tuple(a for a in sys.argv[1:] if not a.startswith("--")) or ("0",)
+    for source in sorted(p for p in HERE.glob("0*.py") if p.name.startswith(wanted)):
         notebook = jupytext.read(source)
         notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
         if "--no-run" not in sys.argv:
