@@ -14,6 +14,7 @@ import sys
 import threading
 
 from ..errors import MagjaxError
+from ..interrupts import raise_if_seen
 from .order import Order
 from .recorder import Ended, Recorder
 
@@ -116,6 +117,7 @@ def record(order: Order, progress=None) -> dict:
 
     `progress(dict)` is called a few times a second. Ctrl-C ends the recording in order and is reported as status 130.
     """
+    raise_if_seen()
     command = [sys.executable, "-m", "magjax.acquire.process"]
     hold_signals(True)  # the recorder inherits it, and lets them come once it can answer them
     try:

@@ -54,12 +54,13 @@ def main(arguments=None) -> int:
         print(f'magjax: no command "{arguments[0]}"{hint}', file=sys.stderr)
         return 2
     from magjax.errors import MagjaxError
+    from magjax.interrupts import watched
 
     from .waiting import Waiting
 
     calm = not {"-h", "--help", "--quiet"}.isdisjoint(arguments)
     try:
-        with Waiting(f"magjax {arguments[0]}", active=not calm):
+        with watched(), Waiting(f"magjax {arguments[0]}", active=not calm):
             module = importlib.import_module(COMMANDS[arguments[0]][0])
             return module.run(arguments[0], arguments[1:]) or 0
     except MagjaxError as error:
