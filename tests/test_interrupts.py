@@ -10,6 +10,14 @@ from magjax.cli import COMMANDS, main
 from magjax.interrupts import raise_if_seen, watched
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Processes that run tests side by side ignore the signal; here it is as at a terminal."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def swallowed():
     """An interrupt as a careless import would take it."""
     try:
