@@ -79,11 +79,16 @@ def drift_of(s):
     """The drift of one record by itself, straight and by the root of time, from zero at its start: (fall of chi2, samples)."""
     t = s.dt * np.arange(s.samples)
     parts = [t / t[-1], np.sqrt(t / t[-1])]
-    reduced = [_between(s, p) for p in parts]
+    best, gain = _combination([_between(s, p) for p in parts])
+    return gain, sum(x * p for x, p in zip(best, parts, strict=True))
+
+
+def _combination(reduced):
+    """Amplitudes of columns of one record, as `_between` gives them, by least squares, and the fall of chi2."""
     G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
     g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
     best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(len(G)), g)
-    return float(best @ g), sum(x * p for x, p in zip(best, parts, strict=True))
+    return best, float(best @ g)
 
 
 def _own_drifts(spectra, common: float) -> RecordEffect | None:
@@ -122,12 +127,10 @@ def _hum(spectra, mains):
         if not parts:
             fits.append(np.zeros(s.samples))
             continue
-        G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for _, b in parts] for _, a in parts])
-        g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for _, a in parts])
-        best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(len(G)), g)
+        best, fall = _combination([reduced for _, reduced in parts])
         if s.samples * s.dt >= min(2 / mains, longest * 0.999):
-            gain += float(best @ g)
-            number += len(g)
+            gain += fall
+            number += len(parts)
         for k in set(kinds):
             power[k] = max(power[k], float(np.linalg.norm(best[np.asarray(kinds) == k])))
         fits.append(sum(x * p for x, (p, _) in zip(best, parts, strict=True)))

@@ -34,7 +34,6 @@ from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
 NEAR_RIVAL, MOST_RIVALS = 0.3, 3  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
-SMALL = 0.1  # of an effect's scale, where it starts from the beginning
 PROGRAMS_KEPT = 4  # trials between which compiled programs are let go
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
@@ -96,9 +95,6 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
             break
         if state.steps and check and _predicts_worse(state.current.actuator, best.result.actuator, check, bench):
             break
-        if state.steps and best.result.chi2_per_sample > MISFIT:
-            again, chosen = _afresh(recordings, bench, best, chosen, choices.rest == "auto", progress)
-            best, good = again, [again if t is best else t for t in good]
         best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress, choices.rest == "auto")
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
@@ -138,22 +134,6 @@ def _backward(recordings, bench, state, chosen, count, progress):
             state.current = trial
 
 
-def _afresh(recordings, bench, best, chosen, any_rest, progress):
-    """The best fitted from the beginning, every effect small: what was fitted while another was missing may lie in the
-    wrong valley. (trial, choices), the given ones where that is no better."""
-    names = tuple(e.name for e in best.result.estimates if e.name.startswith("effects."))
-    actuator = bench.actuator()
-    for effect in best.result.actuator.effects:
-        free = any(n.startswith(f"effects.{effect.name}.") for n in names)
-        actuator = actuator.with_effect(type(effect)().with_amplitude(SMALL * effect.parameters()[effect.amplitude].scale) if free else effect)
-    choices = dataclasses.replace(chosen, rest="auto") if any_rest and bench.start == "auto" else chosen
-    other = fit(recordings, bench, actuator=actuator, extra=names, choices=choices, refine=False, progress=progress)
-    fall = chi2_of(best.result) - chi2_of(other)
-    if not fall > MIN_DROP:
-        return best, chosen
-    return dataclasses.replace(best, result=other, drop=best.drop + fall, bic_change=best.bic_change - fall), other.choices
-
-
 def _exchange(recordings, bench, state, chosen, progress):
     """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
     that was not theirs."""
@@ -163,16 +143,13 @@ def _exchange(recordings, bench, state, chosen, progress):
         if not near or best.name not in {e.name for e in state.current.actuator.effects}:
             continue
         rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
-        excess = max(chi2_of(rest), MIN_DROP)
         own = Trial(best.candidate, state.current, 0.0, best.parameters * np.log(rest.data_count), True, best.explained_share, best.parameters)
         trials = [own]
         for t in sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]:
-            trials.append(try_effect(recordings, bench, rest, t.candidate, classes[t.name], chosen, excess, progress))
+            trial = try_effect(recordings, bench, rest, t.candidate, classes[t.name], chosen, MIN_DROP, progress)
+            trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
         trials = [t for t in trials if t.physical]
         found = min(trials, key=lambda t: t.bic_change)
-        share = {t.name: t.explained_share for t in good}
-        trials = [dataclasses.replace(t, explained_share=share.get(t.name, t.explained_share)) for t in trials]
-        found = next(t for t in trials if t.name == found.name)
         state.steps[index] = (found, rivals_of(found, trials), trials, previous)
         state.current = found.result
 

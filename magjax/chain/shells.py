@@ -10,8 +10,6 @@ steps; one more step with a frozen matrix makes every derivative exact, as in `c
 Means over the shells go to the blocks behind: what the coil sees and what the rod does as a whole.
 """
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -83,12 +81,12 @@ def march_shells(actuator, share, count: int, applied, current, h, memory, schem
         if given:  # p = p0 + q there: what is added to H acts on the loss too
             rhs = rhs - p0 * given[0] - Q @ (jnp.ones(count) * (given[0] + given[1])) - given[2]
 
-        def trial_of(c, drive1, v, m):
+        def trial_of(c, current, v, m):
             X1 = v + m
             change = (1.5 * X1 - 2 * c.X0 + 0.5 * c.X_before) if bdf else X1 - c.X0
-            return Trial(v, m, MU0 * change / h, (v - c.memory.field) / h, drive1, h)
+            return Trial(v, m, MU0 * change / h, (v - c.memory.field) / h, current, h)
 
-        v, m, rising, kept = _solve(table, c, effects, actuator, partial(trial_of, drive1=current1), p0, Q, rhs)
+        v, m, rising, kept = _solve(table, c, effects, actuator, trial_of, current1, p0, Q, rhs)
         trial = trial_of(c, current1, v, m)
         loss, shift, added = _extra_terms(effects, c.states, actuator, trial, 0.0, 0.0)
         H, M = v + shift, m + added
@@ -124,16 +122,16 @@ def _relays(table, memory, v):
     return jax.vmap(one)(memory, v)
 
 
-def _solve(table, c, effects, actuator, trial_of, p0, Q, rhs):
+def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
     """Fields and magnetizations of all shells, with exact derivatives, and their branches."""
-    fixed = stop_gradient((table, c, effects, actuator, Q, rhs, trial_of.keywords["drive1"]))
+    fixed = stop_gradient((table, c, effects, actuator, Q, rhs, current))
 
     def misfit(v):
-        table, c, effects, actuator, Q, rhs, drive1 = fixed
+        table, c, effects, actuator, Q, rhs, current = fixed
         m, slope, *_ = _relays(table, c.memory, v)
 
         def terms(v, m):
-            return _extra_terms(effects, c.states, actuator, trial_of.func(c, drive1, v, m), 0.0, 0.0)
+            return _extra_terms(effects, c.states, actuator, trial_of(c, current, v, m), 0.0, 0.0)
 
         (loss, shift, added), (d_loss, d_shift, d_added) = jax.jvp(terms, (v, m), (jnp.ones_like(v), slope))
         F = p0 * (v + shift) + loss + Q @ (v + shift + m + added) - rhs
@@ -166,6 +164,6 @@ def _solve(table, c, effects, actuator, trial_of, p0, Q, rhs):
         return branch_magnetization(table, rising, threshold, m_there, v)
 
     m = jax.vmap(live)(c.memory, rising, kept, v)
-    loss, shift, added = _extra_terms(effects, c.states, actuator, trial_of(c, v=v, m=m), 0.0, 0.0)
+    loss, shift, added = _extra_terms(effects, c.states, actuator, trial_of(c, current, v, m), 0.0, 0.0)
     change = -inverse @ (p0 * (v + shift) + loss + Q @ (v + shift + m + added) - rhs)
     return v + change, m + slope * change, rising, kept
