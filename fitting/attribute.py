@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from .fit import fit
+from .fit import fit_or_stop as fit
 from .screen import Candidate
 
 LEADERS = 6  # families of directions that are tried
@@ -94,25 +94,44 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     reach = max(abs(t) for t in info.typical) if info.typical else 10 * info.scale
     amplitude = float(np.clip(candidate.amplitude, -reach, reach))
     effect = effect_class(**candidate.shapes).with_amplitude(amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale)
-    names = tuple(f"effects.{effect.name}.{p}" for p in effect.parameters())
-    held = tuple(f"effects.{e.name}.{p}" for e in base.actuator.effects for p in e.parameters())
-    start = base.solution.z[: base.problem.layout.density_unknowns + 1] if warm and choices.knots == base.choices.knots else None
     actuator = base.actuator.with_effect(effect)
-    result = fit(recordings, bench, actuator=actuator, extra=(*held, *names), choices=choices, refine=False, progress=progress, start=start, target=target)
+    start = base.solution.z[: base.problem.layout.density_unknowns + 1] if warm and choices.knots == base.choices.knots else None
+    result = fit(
+        recordings, bench, actuator=actuator, start=start, extra=_effects_of(actuator), choices=choices, refine=False, progress=progress,
+        target=target, spectra=base.spectra,
+    )  # fmt: skip
+    return _credited(candidate, result, base, effect, excess)
+
+
+def settled(recordings, bench, base, trial, excess, progress=None, target: float = np.inf) -> Trial:
+    """The trial, gone on with where it ended far from its start, unsettled, and came near the `target`."""
+    result = trial.result
+    if result.converged or not chi2_of(result) < target:
+        return trial
+    start = result.solution.z[: result.problem.layout.density_unknowns + 1]
+    result = fit(
+        recordings, bench, actuator=result.actuator, start=start, extra=_effects_of(result.actuator), choices=result.choices, refine=False,
+        progress=progress, target=target, spectra=base.spectra,
+    )  # fmt: skip
+    return _credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
+
+
+def _effects_of(actuator) -> tuple[str, ...]:
+    return tuple(f"effects.{e.name}.{p}" for e in actuator.effects for p in e.parameters())
+
+
+def _credited(candidate, result, base, effect, excess) -> Trial:
+    """What a fit with a further effect is worth beside the base's."""
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
-    if not result.converged and chi2_of(result) < target:  # far from the start: go on from there
-        start, more = result.solution.z[: result.problem.layout.density_unknowns + 1], (*held, *names)
-        result = fit(recordings, bench, actuator=result.actuator, extra=more, choices=choices, refine=False, progress=progress, start=start, target=target)
     drop = chi2_of(base) - chi2_of(result)
     physical = all(
-        result.estimate(f"effects.{e.name}.{e.amplitude}").value >= 0
-        for e in result.actuator.effects
-        if e.parameters()[e.amplitude].low >= 0 and f"effects.{e.name}.{e.amplitude}" in (*held, *names)
+        result.estimate(f"effects.{e.name}.{e.amplitude}").value >= 0 for e in result.actuator.effects if e.parameters()[e.amplitude].low >= 0
     )
-    extra = len(names) * np.log(result.data_count)
+    number = len(effect.parameters())
+    extra = number * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
-    return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), len(names))
+    return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), number)
 
 
 def rivals_of(best: Trial, trials) -> list[Trial]:

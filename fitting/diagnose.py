@@ -12,7 +12,7 @@ from magjax.bench import load_bench
 
 from .alternation import alternating
 from .attribute import chi2_of
-from .fit import fit
+from .fit import fit_or_stop as fit
 from .floors import data_problem, record_effects, remove_from_checks, remove_record_effect, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term

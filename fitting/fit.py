@@ -12,6 +12,7 @@ from magjax.simulate import require_x64
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
 from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
+from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 FINER_KNOTS = ((26, 18), (36, 24))
@@ -23,12 +24,13 @@ VALLEY = 0.98  # correlation from which two parameters are one
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
-def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None, target: float = np.inf) -> FitResult:
+def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None, target: float = np.inf, spectra=None) -> FitResult:
     """Fit an actuator to recordings jointly.
 
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
     of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it; `progress`:
-    called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early.
+    called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early; `spectra`: those of
+    the recordings, where another fit of the same has them.
     Returns a `FitResult`; raises `RecordingError` where a recording
     cannot be used and `ConfigurationError` for a wrong bench. Non-convergence is a result, not an exception.
     """
@@ -36,7 +38,7 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     bench = load_bench(bench)
     actuator = bench.actuator() if actuator is None else actuator
     begin = time.perf_counter()
-    spectra = spectra_of(recordings, bench, choices.harmonics)
+    spectra = spectra_of(recordings, bench, choices.harmonics) if spectra is None else spectra
     names = free_parameters(bench, actuator, extra)
     history = []
 
@@ -49,9 +51,17 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
-    if refine and choices.knots is not None:
+    if refine and choices.knots is not None and not solution.interrupted:
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report)
     return dataclasses.replace(finish(problem, solution, choices, bench, recordings, warm), history=tuple(history))
+
+
+def fit_or_stop(*arguments, **options) -> FitResult:
+    """`fit` as a step of something longer: Ctrl-C is raised, not answered with what was reached."""
+    result = fit(*arguments, **options)
+    if result.solution.interrupted:
+        raise KeyboardInterrupt
+    return result
 
 
 RESTS = {"negative_saturation": "negative", "demagnetized": "demagnetized", "positive_saturation": "positive"}
@@ -66,23 +76,39 @@ def _rests(bench, choices):
 
 
 def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):
-    """The fit from each start memory until one meets the noise; the best of them."""
-    best = None
-    for rest in _rests(bench, choices):
+    """The fit from each start memory until one meets the noise; the best of them. The first by itself, then the others side by side."""
+    rests = _rests(bench, choices)
+
+    def run(rest, posed=None):
         tried = dataclasses.replace(choices, rest=rest)
-        if best is not None:
-            problem, z = build_problem(spectra, actuator, bench, names, tried, start)
-        weights = START_WEIGHTS[: len(problem.layout.penalties)]
-        solution = solve(
-            problem, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: report("fit", k, c)
-        )  # fmt: skip
-        levels = solution.z[len(solution.z) - problem.layout.memories :]
-        score = solution.chi2 + float(levels @ levels)
-        if best is None or score < best[3]:
-            best = (problem, solution, tried, score)
+
+        def one(say):
+            known, z = build_problem(spectra, actuator, bench, names, tried, start) if posed is None else posed
+            weights = START_WEIGHTS[: len(known.layout.penalties)]
+            found = solve(known, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: say("fit", k, c))
+            return known, found, tried
+
+        return one
+
+    def serves(known, found):
         # levels that strain their prior tell of a wrong start memory even where the recordings are met
+        levels = found.z[len(found.z) - known.layout.memories :]
         calm = float(levels @ levels) <= CALM * len(levels)
-        if calm and solution.chi2 < REST_SETTLED * problem.data_count:
+        return calm and found.chi2 < REST_SETTLED * known.data_count, found.chi2 + float(levels @ levels)
+
+    ended = [run(rests[0], (problem, z))(report)]
+    if not serves(*ended[0][:2])[0] and not ended[0][1].interrupted:
+        try:
+            ended += together([run(rest) for rest in rests[1:]], report)
+        except KeyboardInterrupt:
+            known, found, tried = ended[0]
+            ended = [(known, dataclasses.replace(found, converged=False, interrupted=True), tried)]
+    best = None
+    for known, found, tried in ended:
+        settled, score = serves(known, found)
+        if best is None or score < best[3]:
+            best = (known, found, tried, score)
+        if settled:
             break
     return best[:3]
 
@@ -104,6 +130,8 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
             trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, target=target,
             progress=lambda k, c: report("finer density", k, c),
         )  # fmt: skip
+        if trial.interrupted:
+            return problem, dataclasses.replace(solution, interrupted=True), choices
         if not trial.chi2 < target:
             break
         problem, solution, choices = trial_problem, trial, finer

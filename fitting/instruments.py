@@ -16,7 +16,8 @@ from magjax.errors import RecordingError
 from magjax.instruments import SENSOR_LAWS, fit_laws, judge_laws, judge_source
 
 from .check import check_errors
-from .fit import RESTS_IN_ORDER, fit
+from .fit import RESTS_IN_ORDER
+from .fit import fit_or_stop as fit
 from .joint import data_residual
 from .setup import build_problem, free_parameters, spectra_of
 from .spectra import line_deviations, reduce_recording, with_noise

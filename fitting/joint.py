@@ -17,6 +17,8 @@ from .model import Layout, Predictor, Target, whitened
 from .solver import damped_step, jacobian
 
 WEIGHT_RANGE = (1e-3, 1e9)
+FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
+STALLED, STALL = 6, 1e-3  # Jacobians, and the share of chi2 that they must take
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Solution:
     jacobians: int
     converged: bool
     seconds: float
+    interrupted: bool = False
 
 
 @eqx.filter_jit
@@ -129,11 +132,11 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
     bounded = jnp.asarray(layout.nonnegative)
     z, weights = np.asarray(z, float), np.asarray(weights, float)
     prior = prior_matrix(problem, weights)
-    begin, converged, taken, damping, decrement, held = time.perf_counter(), False, 0, 1e-2, np.inf, np.inf
+    begin, converged, interrupted, taken, damping, decrement, held = time.perf_counter(), False, False, 0, 1e-2, np.inf, np.inf
     residual = data_residual(problem, z)
     chi2 = float(residual @ residual)
     cost = 0.5 * (chi2 + z @ prior @ z)
-    normal = prior
+    normal, path = prior, [chi2]
     try:
         for taken in range(1, max_jacobians + 1):
             J = data_jacobian(problem, z)
@@ -154,10 +157,13 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
             chi2 = float(residual @ residual)
             if progress is not None:
                 progress(taken, chi2 / count)
+            path.append(chi2)
             if taken > 3 and chi2 - 8 * decrement > target:
                 break
+            if chi2 / count > FAR and len(path) > STALLED and chi2 > (1 - STALL) * path[-STALLED]:
+                break
             settled = decrement < 0.5 + 1e-4 * cost
-            if evidence and chi2 / count < 20:
+            if evidence and chi2 / count < FAR:
                 found = evidence_weights(layout, z, normal, weights)
                 moved = np.max(np.abs(np.log(found / weights)))
                 weights = weights * np.clip(found / weights, 1 / 30, 30)
@@ -176,5 +182,5 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
                     break
                 damping = min(damping, 1e2)
     except KeyboardInterrupt:
-        converged = False
-    return Solution(z, weights, chi2, cost, decrement, normal, taken, converged, time.perf_counter() - begin)
+        converged, interrupted = False, True
+    return Solution(z, weights, chi2, cost, decrement, normal, taken, converged, time.perf_counter() - begin, interrupted)

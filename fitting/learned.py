@@ -19,6 +19,7 @@ from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .nonparametric import ONE, Place, locate_places
 from .setup import build_problem
+from .together import let_go
 from .uncertainty import WIDEN, covariance
 
 TRIED = 3  # leaders that are fitted jointly
@@ -97,6 +98,8 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
             problem, z, weights, max_jacobians=choices.max_jacobians,
             progress=lambda k, c: say(f"learning {' and '.join(place.variables)} at the {place.block}", k, c),
         )  # fmt: skip
+        if solution.interrupted:
+            raise KeyboardInterrupt
         first = problem.layout.index(names[len(base.problem.layout.names)])
         index = slice(first, first + len(term.coefficients))
         cov = covariance(solution.normal, solution.z, n)
@@ -139,7 +142,7 @@ def chosen_places(places) -> list[Place]:
 def learn(base, recordings, bench, progress=None) -> Learned | None:
     """The term that serves best beside a fit, or None where none foretells left-out recordings better."""
     say = progress or (lambda *a: None)
-    jax.clear_caches()  # programs of the search
+    let_go()
     places = [p for p in locate_places(base, say) if p.evidence > 0]
     if not places:
         return None

@@ -5,7 +5,6 @@ Forward, then backward: an effect adopted early that later ones have made needle
 
 import dataclasses
 
-import jax
 import numpy as np
 
 from magjax.effects import CATALOGUE
@@ -24,11 +23,14 @@ from .attribute import (
     family,
     leaders,
     rivals_of,
+    settled,
     try_effect,
 )
 from .check import check_errors
-from .fit import REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER, fit
+from .fit import REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER
+from .fit import fit_or_stop as fit
 from .screen import screen
+from .together import SIDE_BY_SIDE, let_go, together
 from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
@@ -55,8 +57,6 @@ class Reached:
 
 def search(recordings, bench, base, candidates, choices, progress, check=()) -> Reached:
     """Forward: fit the leaders from scratch, adopt the best while it earns its place; then screen again."""
-    say = progress or (lambda *a: None)
-    classes = {c.name: c for c in CATALOGUE}
     count = base.data_count
     state = Reached(base, [], {})
     chosen = base.choices  # the density chosen for the base may be finer than the default: rivals get the same
@@ -68,25 +68,8 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
         excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
-        trials = []
-
-        def attempt(c, trials=trials, excess=excess, chosen=chosen):
-            say(f"trying {c.name}", 0, state.current.chi2_per_sample)
-            reached = min((chi2_of(t.result) for t in trials if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
-            trial = try_effect(recordings, bench, state.current, c, classes[c.name], chosen, excess, progress, bool(state.steps), reached)
-            trials.append(trial)
-            state.tried[c.name] = trial.candidate
-            if len(trials) % PROGRAMS_KEPT == 0:
-                jax.clear_caches()  # programs of trials that are not needed again: some hundred megabytes each
-
-        for c in top:
-            settled = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
-            if settled and c.name not in STRUCTURES and abs(c.z) < CLOSE * abs(settled[0].candidate.z):
-                continue
-            attempt(c)
-        first = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
-        for c in family(first.candidate, candidates, {t.name for t in trials}) if first else ():
-            attempt(c)
+        trials = _trials((recordings, bench, state.current), top, candidates, chosen, excess, bool(state.steps), progress)
+        state.tried.update({t.name: t.candidate for t in trials})
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
         if not good:
             break
@@ -99,11 +82,59 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
         candidates = screened(best.result, choices)
-        jax.clear_caches()
+        let_go()
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         _backward(recordings, bench, state, chosen, count, progress)
         _exchange(recordings, bench, state, chosen, progress)
     return state
+
+
+def _trials(asked, top, candidates, chosen, excess, warm, progress) -> list[Trial]:
+    """The leaders fitted, two side by side, until one meets the noise; then the family of the best.
+
+    `asked`: recordings, bench, and the fit beside which they are tried.
+    """
+    say = progress or (lambda *a: None)
+    classes = {c.name: c for c in CATALOGUE}
+    trials = []
+
+    def useful(*others):
+        return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
+
+    def begun(c, target):
+        return lambda say: try_effect(*asked, c, classes[c.name], chosen, excess, say, warm, target)
+
+    def ended(t, target):
+        return lambda say: settled(*asked, t, excess, say, target)
+
+    def attempt(these):
+        say(f"trying {' and '.join(c.name for c in these)}", 0, asked[2].chi2_per_sample)
+        first = together([begun(c, useful()) for c in these], progress, lambda k, results: _needless(these[k], results.values()))
+        first = [t for t in first if t is not None]
+        trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], progress))
+        if len(trials) % PROGRAMS_KEPT < len(these):
+            let_go()
+
+    while top:
+        attempt(top[:SIDE_BY_SIDE])
+        top = [c for c in top[SIDE_BY_SIDE:] if not _needless(c, trials)]
+    best = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
+    like = family(best.candidate, candidates, {t.name for t in trials}) if best else []
+    for k in range(0, len(like), SIDE_BY_SIDE):
+        attempt(like[k : k + SIDE_BY_SIDE])
+    return trials
+
+
+def _to_the_end(recordings, bench, base, candidate, effect_class, choices, excess, progress):
+    """A trial, settled."""
+    trial = try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress)
+    return settled(recordings, bench, base, trial, excess, progress)
+
+
+def _needless(candidate, trials) -> bool:
+    """Whether a leader that meets the noise leaves only close rivals to try, and this is none."""
+    met = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
+    return candidate.name not in STRUCTURES and any(abs(candidate.z) < CLOSE * abs(t.candidate.z) for t in met)
 
 
 def _predicts_worse(before, after, check, bench) -> bool:
@@ -127,7 +158,8 @@ def _backward(recordings, bench, state, chosen, count, progress):
         say(f"without {name}", 0, state.current.chi2_per_sample)
         fewer = actuator.without_effect(name)
         held = tuple(f"effects.{e.name}.{p}" for e in fewer.effects for p in e.parameters())
-        trial = fit(recordings, bench, actuator=fewer, extra=held, choices=chosen, refine=False, progress=progress)
+        more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra}
+        trial = fit(recordings, bench, actuator=fewer, extra=held, **more)
         rise = chi2_of(trial) - chi2_of(state.current)
         if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
             state.steps.remove(step)
@@ -145,8 +177,12 @@ def _exchange(recordings, bench, state, chosen, progress):
         rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
         own = Trial(best.candidate, state.current, 0.0, best.parameters * np.log(rest.data_count), True, best.explained_share, best.parameters)
         trials = [own]
-        for t in sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]:
-            trial = try_effect(recordings, bench, rest, t.candidate, classes[t.name], chosen, MIN_DROP, progress)
+        near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
+
+        def beside(t, rest=rest):
+            return lambda say: _to_the_end(recordings, bench, rest, t.candidate, classes[t.name], chosen, MIN_DROP, say)
+
+        for t, trial in zip(near, together([beside(t) for t in near], progress), strict=True):
             trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
         trials = [t for t in trials if t.physical]
         found = min(trials, key=lambda t: t.bic_change)
@@ -162,20 +198,24 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress, any
     better by MIN_DROP.
     """
     names = tuple(e.name for e in best.result.estimates if e.name.startswith("effects."))
+    more = {"actuator": best.result.actuator, "extra": names, "progress": progress, "spectra": best.result.spectra}
     found = chosen
     later = chosen.rest != RESTS_IN_ORDER[0]
     if any_rest and bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
         free = dataclasses.replace(chosen, rest="auto")
-        other = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=free, refine=False, progress=progress)
+        other = fit(recordings, bench, choices=free, refine=False, **more)
         margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
         if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices
     if chosen.knots is not None and REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BETWEEN[1]:
-        found = fit(recordings, bench, actuator=best.result.actuator, extra=names, choices=found, refine=True, progress=progress).choices
+        found = fit(recordings, bench, choices=found, refine=True, **more).choices
     if found == chosen:
         return best, good, chosen
     classes = {c.name: c for c in CATALOGUE}
     near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
-    again = [try_effect(recordings, bench, current, t.candidate, classes[t.name], found, excess, progress) for t in near]
-    again = [t for t in again if t.physical] or [best]
+
+    def anew(t):
+        return lambda say: _to_the_end(recordings, bench, current, t.candidate, classes[t.name], found, excess, say)
+
+    again = [t for t in together([anew(t) for t in near], progress) if t.physical] or [best]
     return min(again, key=lambda t: t.bic_change), again, found

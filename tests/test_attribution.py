@@ -23,7 +23,7 @@ def candidate(name, z, direction=(1.0, 0.0, 0.0), visibility=0.1):
 def trial(name, chi2n, parameters=1, base=3.0, physical=True, direction=(1.0, 0.0, 0.0)):
     """A fit that ended at chi2/N."""
     drop = (base - chi2n) * COUNT
-    result = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
+    result = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, converged=True)
     return Trial(candidate(name, 20.0, direction), result, drop, parameters * np.log(COUNT) - drop, physical, drop / ((base - 0.92) * COUNT), parameters)
 
 
@@ -93,7 +93,7 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     from magjax.bench import load_bench
 
     best = trial("second_mode", 1.0)
-    best.result.estimates, best.result.actuator = (), None
+    best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
     monkeypatch.setattr(module, "fit", lambda *a, choices, **k: other if choices.rest == "auto" else pytest.fail("not asked"))
     again = []

@@ -55,6 +55,22 @@ def test_names_a_concealed_sensor_filter(bench):
     assert abs(after - 405) < 0.2 * abs(before - 405)
 
 
+@pytest.mark.parametrize("inside", ["the first fit", "trials side by side"])
+def test_ctrl_c_ends_a_diagnosis(bench, inside):
+    runs, _ = study(bench, SensorLag(tau=1e-4, order2=0.5))
+    others = tuple(e.name for e in CATALOGUE if e.name not in {"sensor_lag", "mean_field", "duffing_stiffness"})
+    said = []
+
+    def stop(text, step, chi2):
+        said.append(text)
+        if step == 2 and (inside == "the first fit" or any(t.startswith("trying") for t in said)):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        diagnose(runs[:3], bench, choices=Choices(fine=250, without=others), progress=stop)
+    assert any(" and " in t for t in said) == (inside != "the first fit")
+
+
 def test_a_transient_is_a_data_problem(bench):
     runs, _ = study(bench)
     run = runs[1]

@@ -1,0 +1,55 @@
+"""Fits side by side: order, errors, Ctrl-C."""
+
+import threading
+import time
+
+import pytest
+
+from fitting.together import together
+
+
+def test_results_stand_in_the_order_of_the_calls():
+    met = threading.Barrier(2, timeout=20)  # both must be under way at once
+
+    def call(k):
+        def run(say):
+            if k < 2:
+                met.wait()
+            time.sleep(0.05 * (3 - k))
+            return k
+
+        return run
+
+    assert together([call(k) for k in range(3)]) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("error", [ValueError("wrong"), KeyboardInterrupt()])
+def test_an_error_ends_the_others(error):
+    words, begun = [], threading.Event()
+
+    def first(say):
+        begun.wait(20)
+        raise error
+
+    def endless(say):
+        while True:
+            begun.set()
+            say("still", len(words), None)
+            time.sleep(0.01)
+
+    with pytest.raises(type(error)):
+        together([first, endless], lambda *w: words.append(w))
+    assert words
+
+
+def test_what_another_makes_needless_is_ended_and_given_up():
+    def endless(say):
+        while True:
+            say("still", 0, None)
+            time.sleep(0.01)
+
+    def needless(k, results):
+        return k != 1 and results.get(1) == "serves"
+
+    quick = together([lambda say: "done before", lambda say: time.sleep(0.1) or "serves", endless], None, needless)
+    assert quick == [None, "serves", None]  # whether it was done before or not: the clock decides nothing
