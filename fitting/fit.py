@@ -166,9 +166,10 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
     cov = covariance(solution.normal, solution.z, problem.layout.density_unknowns)
     effective = float(np.trace(cov @ (solution.normal - prior_matrix(problem, solution.weights))))
     chi2n = solution.chi2 / count
-    message = outcome(chi2n, per_recording, solution, rows, problem) + valleys(correlations(problem, refined)) + unsettled(problem.spectra)
+    related = correlations(problem, refined)
+    message = outcome(chi2n, per_recording, solution, rows, problem) + valleys(related) + unsettled(problem.spectra)
     return FitResult(
-        fitted, bench, bool(solution.converged), message, tuple(rows), correlations(problem, refined), per_recording, float(chi2n), count,
+        fitted, bench, bool(solution.converged), message, tuple(rows), related, per_recording, float(chi2n), count,
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
         problem.spectra, choices,
     )  # fmt: skip

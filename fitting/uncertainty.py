@@ -65,12 +65,13 @@ def correlations(problem, solution) -> dict:
     """Correlation of each pair of free physical parameters: "a~b" -> coefficient."""
     layout = problem.layout
     cov = covariance(solution.normal, solution.z, layout.density_unknowns)
+    names = layout.names
+    at = [layout.index(name) for name in names]
     found = {}
-    for i, a in enumerate(layout.names):
-        for b in layout.names[i + 1 :]:
-            ia, ib = layout.index(a), layout.index(b)
-            spread = np.sqrt(cov[ia, ia] * cov[ib, ib])
-            found[f"{a}~{b}"] = float(cov[ia, ib] / spread) if spread > 0 else 0.0
+    for i, a in enumerate(names):
+        for j in range(i + 1, len(names)):
+            spread = np.sqrt(cov[at[i], at[i]] * cov[at[j], at[j]])
+            found[f"{a}~{names[j]}"] = float(cov[at[i], at[j]] / spread) if spread > 0 else 0.0
     return found
 
 
