@@ -110,7 +110,9 @@ def _steady_state(predictor, actuator):
 
 @eqx.filter_jit
 def _late_columns(predictor, actuator, states, effects):
-    """d lines / d amplitude of effects behind the hysteresis: no march, only the blocks after it."""
+    """d lines / d amplitude of effects behind the hysteresis: no march, only the blocks after it.
+
+    `effects`: of each kind one, its shapes stacked."""
 
     def lines_of(effect, amplitude):
         changed = dataclasses.replace(actuator, effects=(*actuator.effects, effect.with_amplitude(amplitude)))
@@ -124,7 +126,10 @@ def _late_columns(predictor, actuator, states, effects):
         parts = [jax.vmap(one)(d, t, H, M) for d, t, (H, M) in zip(predictor.drives, predictor.steps, states, strict=True)]
         return jnp.concatenate(parts)[np.asarray(predictor.index)]
 
-    return [jax.jvp(lambda a, e=e: lines_of(e, a), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1] for e in effects]
+    def column(effect):
+        return jax.jvp(lambda a: lines_of(effect, a), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
+
+    return [jax.vmap(column)(e) for e in effects]
 
 
 def changed_drive(actuator, drive, line):
@@ -202,11 +207,11 @@ def columns(problem, z):
     predictor = problem.predictors[0]
     classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
     found = []
-    late = [(c, shapes) for c in classes if not c.in_step and c.block != "source" for shapes in shape_grid(c)]
-    states = _steady_state(predictor, actuator)
+    late = [c for c in classes if not c.in_step and c.block != "source"]
     if late:
-        lines = _late_columns(predictor, actuator, states, tuple(c(**shapes) for c, shapes in late))
-        found += [(c, shapes, line) for (c, shapes), line in zip(late, lines, strict=True)]
+        stacked = tuple(jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shape_grid(c))) for c in late)
+        lines = _late_columns(predictor, actuator, _steady_state(predictor, actuator), stacked)
+        found += [(c, shapes, line) for c, of in zip(late, lines, strict=True) for shapes, line in zip(shape_grid(c), of, strict=True)]
     marching = [(c, shapes) for c in classes if c.in_step and not c.shells for shapes in shape_grid(c)]
     drives = [np.asarray(d) for d in predictor.drives]
     sources = [

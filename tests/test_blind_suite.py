@@ -17,7 +17,7 @@ from tests.blind.generator.instruments import record
 from tests.blind.generator.strain import settled_play
 from tests.blind.oracle import Sight
 from tests.blind.run import diagnose
-from tests.blind.score import judge, wilson
+from tests.blind.score import coverage, judge, kept_line, wilson
 from tests.blind.strengths import GROUPS, HIDDEN, OUTSIDE, VISIBLE
 
 FOLDER = Path(__file__).parent / "blind"
@@ -192,3 +192,5 @@ def test_sample_through_the_command_line(tmp_path):
     assert ended["status"] == 0, ended["last"]
     said = json.loads((tmp_path / "result" / "diagnosis.json").read_text())
     assert judge(case, said) == "right", said["message"]
+    kept = json.loads(kept_line(case.name, ended, said))["diagnosis"]  # a row of --keep scores the same
+    assert judge(case, kept) == "right" and list(coverage(case, kept)) == list(coverage(case, said)) and len(kept["check"]) == 1

@@ -1,6 +1,6 @@
 """Run a suite through the command line: `python -m tests.blind.run dev --out blind-results --workers 2`.
 
-Resumable: a case with done.json is skipped; every case is a process of its own. One folder a case holds the command's results
+Resumable: a case with done.json is skipped, and with --kept FILE.jsonl (see `score`) one that stands there; every case is a process of its own. One folder a case holds the command's results
 and done.json (exit status, seconds, peak memory); recordings are written, used and removed, for they follow from the case.
 """
 
@@ -73,12 +73,15 @@ def main():
     p.add_argument("--out", type=Path, default=Path("blind-results"))
     p.add_argument("--workers", type=int, default=1)
     p.add_argument("--numbers", type=int, nargs="*", help="only these cases")
+    p.add_argument("--kept", type=Path, help="a file of score --keep: its cases are not run again")
     p.add_argument("--until", type=float, default=float("inf"), help="start no case after this many seconds")
     options = p.parse_args()
     if json.loads(SEALS.read_text())[options.suite]["sha256"] != seal(options.suite):
         sys.exit(f"the labels of {options.suite} are not the sealed ones of {SEALS.name}: a case was changed after the seal")
     begin = time.time()
+    kept = {json.loads(line)["name"] for line in options.kept.read_text().splitlines()} if options.kept else set()
     numbers = range(size(options.suite)) if options.numbers is None else options.numbers
+    numbers = [k for k in numbers if f"{options.suite}-{k:03d}" not in kept]
 
     def one(number):
         return (

@@ -1,4 +1,6 @@
-"""Score a suite: `python -m tests.blind.score dev --out blind-results [--cases] [--table FILE]`, Markdown.
+"""Score a suite: `python -m tests.blind.score dev --out blind-results [--cases] [--table FILE] [--keep FILE.jsonl]`, Markdown.
+
+--keep writes what the score is made from, one line a case; such a file serves as --out too, and as the runner's --kept.
 
 Outcomes. right: exactly what is concealed is named, nothing else (nulls: silence; outside: unknown_at; data: data_problem or a
 refusal). group: the truth stands in a group and nothing foreign is named. kin: another member of the truth's known group is named
@@ -78,15 +80,53 @@ def _naming(truth, named, grouped, groups):
 
 
 def read(suite: str, out: Path):
-    """(case, diagnosis or None, done) of every case that is done."""
+    """(case, diagnosis or None, done) of every case that is done: from the runner's folder or from a file of --keep."""
+    for name, done, diagnosis in _kept(Path(out)) if Path(out).is_file() else _folders(suite, Path(out)):
+        if done["status"] != GENERATOR_FAILED:  # a bench that could not be made says nothing
+            yield make_case(suite, int(name.rpartition("-")[2])), diagnosis, done
+
+
+def _folders(suite, out):
     for k in range(size(suite)):
-        case = make_case(suite, k)
-        folder = Path(out) / case.name
+        folder = out / f"{suite}-{k:03d}"
         if (folder / "done.json").exists():
             path = folder / "result" / "diagnosis.json"
-            done = json.loads((folder / "done.json").read_text())
-            if done["status"] != GENERATOR_FAILED:  # a bench that could not be made says nothing
-                yield case, json.loads(path.read_text()) if path.exists() else None, done
+            yield folder.name, json.loads((folder / "done.json").read_text()), json.loads(path.read_text()) if path.exists() else None
+
+
+def _kept(path):
+    for line in path.read_text().splitlines():
+        row = json.loads(line)
+        yield row["name"], row["done"], row["diagnosis"]
+
+
+SCORED = ("coil.R_eddy", "mechanics.xi", "mechanics.f0")
+
+
+def kept_line(name: str, done: dict, diagnosis) -> str:
+    """A case's row of --keep: what the score reads of it, figures rounded to six digits."""
+    row = {"name": name, "done": {k: done[k] for k in ("status", "seconds")}, "diagnosis": None}
+    if diagnosis:
+        fits = {}
+        for key in ("base", "repaired"):
+            fitted = diagnosis.get(key)
+            known = {n: {k: p.get(k) for k in ("value", "stderr")} for n, p in fitted.get("parameters", {}).items() if n in SCORED} if fitted else {}
+            fits[key] = {"chi2_per_sample": fitted["chi2_per_sample"], "parameters": known} if fitted else None
+        row["diagnosis"] = {
+            "verdict": diagnosis["verdict"], "groups": diagnosis["groups"], "absorbed": diagnosis["absorbed"],
+            "effects": [{k: e[k] for k in ("name", "confidence")} for e in diagnosis["effects"]],
+            "unknown": {"block": (diagnosis["unknown"] or {}).get("block")},
+            "check": [{k: c[k] for k in ("rms_before", "rms_after", "noise_rms")} for c in diagnosis["check"]], **fits,
+        }  # fmt: skip
+    return json.dumps(_rounded(row))
+
+
+def _rounded(value):
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return [_rounded(v) for v in value] if isinstance(value, list) else value
 
 
 def gap_closed(diagnosis):
@@ -100,7 +140,7 @@ def gap_closed(diagnosis):
 def coverage(case, diagnosis):
     """Whether each 90 % interval of R_eddy, xi and f0 holds the truth."""
     fitted = (diagnosis.get("repaired") or diagnosis.get("base") or {}).get("parameters", {})
-    for key in ("coil.R_eddy", "mechanics.xi", "mechanics.f0"):
+    for key in SCORED:
         p, true = fitted.get(key), case.truth[key.split(".")[1]]
         if p and p.get("stderr"):
             yield abs(p["value"] - true) <= 1.645 * p["stderr"]
@@ -226,6 +266,7 @@ def main():
     p.add_argument("--out", type=Path, default=Path("blind-results"))
     p.add_argument("--cases", action="store_true")
     p.add_argument("--table", type=Path)
+    p.add_argument("--keep", type=Path)
     options = p.parse_args()
     rows = list(read(options.suite, options.out))
     if not rows:
@@ -248,6 +289,8 @@ def main():
         print(*words, "|", _spoken(diagnosis, done), chi, ratio, done["seconds"], "s", flush=True)
     text = table(options.suite, rows)
     print(text)
+    if options.keep:
+        options.keep.write_text("".join(kept_line(c.name, done, d) + "\n" for c, d, done in rows))
     if options.table:
         options.table.write_text(text + "\n")
 
