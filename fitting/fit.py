@@ -18,6 +18,7 @@ from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 FINER_KNOTS = ((26, 18), (36, 24))
 FINER_TAKES = 0.7  # of the excess may be left
 REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
+REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be the density
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 VALLEY = 0.98  # correlation from which two parameters are one
@@ -117,7 +118,8 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
     """Finer hats where chi2 stays above the noise and they lower it clearly."""
     count = problem.data_count
     for knots in FINER_KNOTS:
-        highest = REFINE_MATERIAL if bench.drive == "field" else REFINE_BETWEEN[1]
+        beside = REFINE_BESIDE if actuator.effects else REFINE_BETWEEN[1]
+        highest = REFINE_MATERIAL if bench.drive == "field" else beside
         if not REFINE_BETWEEN[0] < solution.chi2 / count < highest:
             break
         finer = dataclasses.replace(choices, knots=knots, level=max(choices.level, 4 * knots[0]))

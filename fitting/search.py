@@ -27,7 +27,7 @@ from .attribute import (
     try_effect,
 )
 from .check import check_errors
-from .fit import REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER
+from .fit import REFINE_BESIDE, REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER
 from .fit import fit_or_stop as fit
 from .screen import screen
 from .together import SIDE_BY_SIDE, let_go, together
@@ -207,7 +207,7 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress, any
         margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
         if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices
-    if chosen.knots is not None and REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BETWEEN[1]:
+    if chosen.knots is not None and REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BESIDE:
         found = fit(recordings, bench, choices=found, refine=True, **more).choices
     if found == chosen:
         return best, good, chosen

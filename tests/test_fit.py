@@ -1,6 +1,7 @@
 """The joint fit on an invented bench: the noise reached, the constants within their errors, determinism, outcomes."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -201,3 +202,24 @@ def test_lambda_s_freed_with_a_prior_comes_back_and_the_valley_is_told(recording
     assert abs(stroke.value - true) < 3 * stroke.stderr < 0.1 * true
     assert abs(resistance.value - 62) < 3 * resistance.stderr and resistance.stderr > 0.4
     assert "a valley" in got.message and "lambda_s" in got.message
+
+
+def test_a_bent_step_follows_the_valley(monkeypatch):
+    """r = (50 (a b - 1), a - 3): along a b = 1 a straight step leaves the valley, a bent one hardly."""
+    import fitting.joint as module
+
+    def residual(problem, z):
+        return np.array([50 * (z[0] * z[1] - 1), z[0] - 3, 0.0])
+
+    monkeypatch.setattr(module, "data_residual", residual)
+    problem = SimpleNamespace(layout=SimpleNamespace(nonnegative=np.array([False, False])))
+    z, damping = np.array([1.0, 1.0]), 1e-3
+    J = np.array([[50 * z[1], 50 * z[0]], [1.0, 0.0], [0.0, 0.0]])
+    r, normal = residual(problem, z), J.T @ J
+    new = z - np.linalg.solve(normal + damping * np.diag(np.diag(normal)), J.T @ r)
+    bent = module.bent_step(problem, z, new, r, J, normal, damping)
+    straight_cost, bent_cost, cost = (float(np.sum(residual(problem, x) ** 2)) for x in (new, bent, z))
+    assert straight_cost > 10 * cost and bent_cost < 0.75 * cost and bent[0] > 1.2
+    problem.layout.nonnegative = np.array([True, True])
+    held = module.bent_step(problem, np.array([1.0, 0.1]), np.array([1.2, 0.0]), r, J, normal, damping)
+    assert held[1] == 0.0  # what the step has put at its bound stays there
