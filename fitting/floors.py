@@ -14,6 +14,7 @@ from .spectra import fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
+RESTLESS = 5.0  # mean square of the first period between its harmonics over the white noise
 OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record by itself, and the share of records that must show it
 
 
@@ -214,7 +215,29 @@ def data_problem(recordings, spectra, output) -> str | None:
             f"{recording.name}: the periods do not repeat: the last differs from the first by {change:.3g} rms within "
             f"{s.samples * s.dt * 1e3:.3g} ms, and no drift explains it; wait until the reading is settled, then record"
         )
+    if (share := _restless(recordings, spectra, output)) is not None:
+        return (
+            f"the periods do not repeat: in most recordings the last differs from the first by {share:.1%} of the motion, and neither drift nor "
+            "noise explains it; wait until the reading is settled, then record"
+        )
     return None
+
+
+def _restless(recordings, spectra, output) -> float | None:
+    """Change from the first period to the last over the motion (median), where most recordings change and it is not their noise.
+
+    A slow decay in every recording counts into the estimate of the noise; its first period still stands out of the white part.
+    """
+    changes, risen = [], []
+    for recording, s in zip(recordings, spectra, strict=True):
+        if s.periods >= 2:
+            y = _reading(recording, s, output) - drift_of(s)[1]
+            left = fit_lines(y, np.arange(s.samples) * s.dt * s.frequency, len(s.reading) - 1)[1]
+            changes.append(_period_change(s, y) / s.peak_to_peak)
+            risen.append(np.mean(left[: int(s.samples / s.periods)] ** 2) / s.noise.white)
+    if not changes or np.median(risen) < RESTLESS or np.mean(np.asarray(changes) > 0.01) < OWN_SHARE:
+        return None
+    return float(np.median(changes))
 
 
 def _reading(recording, s, output):

@@ -81,6 +81,19 @@ def test_a_transient_is_a_data_problem(bench):
     assert text is not None and "transient" in text
 
 
+def test_a_slow_decay_in_every_recording_is_a_data_problem(bench):
+    """Ringing off the harmonics for two periods, in every recording: a straight drift and a raised noise must not take it."""
+    runs, _ = study(bench)
+    bad = []
+    for run in runs:
+        f, y = run.frequency(), run.channels["displacement"]
+        ring = 0.04 * np.ptp(y) * np.exp(-run.time * f / 1.5) * np.cos(2 * np.pi * 0.37 * f * run.time)
+        bad.append(Recording(run.time, {**run.channels, "displacement": y + ring}, {}, run.origin, run.name))
+    text = data_problem(bad, spectra_of(bad, bench), "displacement")
+    assert text is not None and "in most recordings" in text
+    assert data_problem(runs, spectra_of(runs, bench), "displacement") is None
+
+
 def test_periods_that_do_not_divide_are_no_data_problem():
     bench = load_bench("aa-050h")
     rng = np.random.default_rng(2)
