@@ -19,7 +19,7 @@ from .learned import with_learned_term
 from .locate import where
 from .placebo import placebo
 from .screen import offset_score
-from .search import screened, search
+from .search import SECOND_Z, screened, search
 from .setup import Choices, spectra_of
 from .verdict import ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, too_little, verdict
 
@@ -70,9 +70,10 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     )
     found = verdict(evidence)
     if found.verdict == "unknown_at":
-        found = with_learned_term(found, base_now, recordings, bench, cleaned_check, progress)
-        if _nowhere(evidence) and "function" not in found.unknown:  # nor does a smooth function of the signals: no place can be told
+        if _rough(evidence):
             found = verdict(evidence, rough=True)
+        else:
+            found = with_learned_term(found, base_now, recordings, bench, cleaned_check, progress)
     if placebo_runs > 0:
         found = dataclasses.replace(found, placebo=placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress))
     if zero is None:
@@ -115,8 +116,11 @@ def _floors(result) -> dict:
     return {"noise_rms": noise, "solver_rms": solver_floor(result.problem, result.solution), "density_rms": float(noise * np.sqrt(above))}
 
 
-def _nowhere(evidence) -> bool:
-    """Whether little is left and nothing scores, or what does takes too little of it."""
+def _rough(evidence) -> bool:
+    """Whether what is left is the density's: little, nothing scores beyond what a rough one leaves, and nothing earned its place.
+
+    A smooth function could always be learned from it, and would be no physics.
+    """
     highest = max((abs(c.z) for c in evidence.candidates), default=0.0)
-    nothing = not evidence.reached.steps and highest < Z_THRESHOLD or too_little(evidence.reached, evidence.plain)
+    nothing = not evidence.reached.steps and highest < SECOND_Z or too_little(evidence.reached, evidence.plain)
     return bool(nothing) and evidence.excess < ROUGH_CHI2

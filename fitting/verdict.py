@@ -185,9 +185,10 @@ def _silent(evidence, common, dropped, rough) -> Diagnosis:
     else:
         best = evidence.candidates[0] if evidence.candidates else None
         highest = f"{best.name}, z = {best.z:.1f}" if best else "none"
-        text += f"no effect of the catalogue scores above {Z_THRESHOLD} (highest: {highest})."
+        earned = "earned its place" if rough else f"scores above {Z_THRESHOLD}"
+        text += f"no effect of the catalogue {earned} (highest: {highest})."
     if rough:
-        text += " What is left above the noise follows no smooth function of the signals either: a density rougher than the fit's, most likely."
+        text += " What is left above the noise is a density rougher than the fit's, most likely."
     if evidence.absorbed:
         text += f" These recordings could not show {', '.join(evidence.absorbed)}: the density absorbs them."
     return Diagnosis("nothing_missing", text, **common)

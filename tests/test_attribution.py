@@ -104,3 +104,14 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     assert chosen.rest == (found if taken else held) and again == ([found] if taken else [])
     fixed = module._finer(None, bench, None, best, [best], Choices(rest=held), 1.0, None, any_rest=False)
     assert fixed[2].rest == held
+
+
+@pytest.mark.parametrize(
+    ("chi2n", "z", "rough"), [(1.8, 6.5, True), (1.8, 9.0, False), (4.0, 6.5, False)], ids=["a rough density", "something scores", "too much is left"]
+)
+def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
+    from fitting.diagnose import _rough
+
+    plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
+    evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=(candidate("creep", z),), excess=chi2n)
+    assert _rough(evidence) == rough
