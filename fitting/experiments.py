@@ -18,7 +18,7 @@ from magjax.errors import MagjaxError
 from .model import Predictor, whitened
 from .solver import jacobian
 from .spectra import line_deviations
-from .together import together
+from .together import let_go, together
 from .uncertainty import covariance
 
 SURE = 0.9
@@ -102,6 +102,7 @@ def menu(spectra, bench) -> list[tuple[float, float, float]]:
 
 def separations(trials, drives, spectra):
     """Distance of every pair of rivals on every drive, standard deviations: (drives, pairs); None where one cannot be simulated."""
+    let_go()
     try:
         known = together([lambda _, t=t: _predicted(t.result, drives, spectra) for t in trials])
     except MagjaxError:

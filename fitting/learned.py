@@ -150,6 +150,7 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
     for place in chosen_places(places):
         met = [t for t in tried if t.result.chi2_per_sample < MET and place.evidence < CLOSE * t.place.evidence]
         if not met:
+            let_go()
             tried.append(fit_term(base, place, recordings, bench, progress))
     tried = sorted((t for t in tried if np.isfinite(t.result.chi2_per_sample)), key=lambda t: t.left_out[1])
     if not tried or not tried[0].worth:
