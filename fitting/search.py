@@ -36,7 +36,6 @@ from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
 NEAR_RIVAL, MOST_RIVALS = 0.3, 3  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
-PROGRAMS_KEPT = 4  # trials between which compiled programs are let go
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
@@ -112,8 +111,7 @@ def _trials(asked, top, candidates, chosen, excess, warm, progress) -> list[Tria
         first = together([begun(c, useful()) for c in these], progress, lambda k, results: _needless(these[k], results.values()))
         first = [t for t in first if t is not None]
         trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], progress))
-        if len(trials) % PROGRAMS_KEPT < len(these):
-            let_go()
+        let_go()
 
     while top:
         attempt(top[:SIDE_BY_SIDE])
