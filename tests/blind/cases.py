@@ -19,7 +19,7 @@ from .generator.instruments import record
 from .strengths import BLOCK_OF_OUTSIDE, FAULTS, HIDDEN, LEVELS, OUTSIDE, VISIBLE
 
 SEALS = Path(__file__).with_name("SEALS.json")
-SUITES = {"dev": 1, "val": 2, "test": 3}
+SUITES = {"dev": 1, "val": 2, "test": 3, "practice": 4}
 FREQUENCIES = (10, 25, 50, 80, 120, 160, 200, 250, 300)
 
 
