@@ -11,6 +11,7 @@ import numpy as np
 
 from .fit import fit_or_stop as fit
 from .screen import Candidate
+from .setup import effect_parameters
 
 LEADERS = 6  # families of directions that are tried
 FAMILY = 0.85  # |cos| of two directions that makes a family
@@ -97,7 +98,7 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     actuator = base.actuator.with_effect(effect)
     start = base.solution.z[: base.problem.layout.density_unknowns + 1] if warm and choices.knots == base.choices.knots else None
     result = fit(
-        recordings, bench, actuator=actuator, start=start, extra=_effects_of(actuator), choices=choices, refine=False, progress=progress,
+        recordings, bench, actuator=actuator, start=start, extra=effect_parameters(actuator), choices=choices, refine=False, progress=progress,
         target=target, spectra=base.spectra,
     )  # fmt: skip
     return _credited(candidate, result, base, effect, excess)
@@ -110,14 +111,10 @@ def settled(recordings, bench, base, trial, excess, progress=None, target: float
         return trial
     start = result.solution.z[: result.problem.layout.density_unknowns + 1]
     result = fit(
-        recordings, bench, actuator=result.actuator, start=start, extra=_effects_of(result.actuator), choices=result.choices, refine=False,
+        recordings, bench, actuator=result.actuator, start=start, extra=effect_parameters(result.actuator), choices=result.choices, refine=False,
         progress=progress, target=target, spectra=base.spectra,
     )  # fmt: skip
     return _credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
-
-
-def _effects_of(actuator) -> tuple[str, ...]:
-    return tuple(f"effects.{e.name}.{p}" for e in actuator.effects for p in e.parameters())
 
 
 def _credited(candidate, result, base, effect, excess) -> Trial:

@@ -20,7 +20,7 @@ from .locate import where
 from .placebo import placebo
 from .screen import offset_score
 from .search import SECOND_Z, screened, search
-from .setup import Choices, spectra_of
+from .setup import Choices, effect_parameters, spectra_of
 from .verdict import ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, too_little, verdict
 
 RECORD_Z = 8.0
@@ -40,7 +40,7 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     recordings, check = list(recordings), list(check)
     if known := known_instruments(recordings, calibration, bench):
         return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
-    held = tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
+    held = effect_parameters(actuator)
     spectra = spectra_of(recordings, bench, choices.harmonics)
     say("between the harmonics", 0, None)
     if alternation := alternating(recordings, spectra, bench.output):

@@ -30,10 +30,10 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
 
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
     of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it; `progress`:
-    called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early; `spectra`: those of
-    the recordings, where another fit of the same has them.
-    Returns a `FitResult`; raises `RecordingError` where a recording
-    cannot be used and `ConfigurationError` for a wrong bench. Non-convergence is a result, not an exception.
+    called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early;
+    `spectra`: those of the recordings, where another fit of the same has them.
+    Returns a `FitResult`; raises `RecordingError` where a recording cannot be used and `ConfigurationError` for a wrong
+    bench. Non-convergence is a result, not an exception.
     """
     require_x64()
     bench = load_bench(bench)

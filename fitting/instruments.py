@@ -19,7 +19,7 @@ from .check import check_errors
 from .fit import RESTS_IN_ORDER
 from .fit import fit_or_stop as fit
 from .joint import data_residual
-from .setup import build_problem, free_parameters, spectra_of
+from .setup import build_problem, effect_parameters, free_parameters, spectra_of
 from .spectra import line_deviations, reduce_recording, with_noise
 
 SECOND_ORDER = 0.05  # order2 from which a sensor's filter is one of second order
@@ -240,9 +240,8 @@ def diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices
         return dataclasses.replace(found, message=f"{found.message} {texts}".strip())
     say("the plain model, for comparison", 0, None)
     final = found.repaired or found.base
-    held = tuple(f"effects.{e.name}.{p}" for e in (plain_start.effects if plain_start is not None else ()) for p in e.parameters())
-    plain = fit(on_command(recordings), bench, actuator=plain_start, extra=held, choices=dataclasses.replace(choices, rest=final.choices.rest),
-                progress=progress, refine=False)  # fmt: skip
+    plain = fit(on_command(recordings), bench, actuator=plain_start, extra=effect_parameters(plain_start),
+                choices=dataclasses.replace(choices, rest=final.choices.rest), progress=progress, refine=False)  # fmt: skip
     return _joined(known, found, plain, final, on_command(check), without_command(check), bench, texts)
 
 

@@ -18,9 +18,9 @@ from .solver import damped_step, jacobian
 
 WEIGHT_RANGE = (1e-3, 1e9)
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
+STALLED, STALL = 6, 1e-3  # Jacobians, and the share of chi2 that they must take
 CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
 BEND = 0.2  # of the step, over which its curvature is taken
-STALLED, STALL = 6, 1e-3  # Jacobians, and the share of chi2 that they must take
 
 
 @dataclasses.dataclass(frozen=True)

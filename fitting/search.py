@@ -30,6 +30,7 @@ from .check import check_errors
 from .fit import REFINE_BESIDE, REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER
 from .fit import fit_or_stop as fit
 from .screen import screen
+from .setup import effect_parameters
 from .together import SIDE_BY_SIDE, let_go, together
 from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 
@@ -155,9 +156,8 @@ def _backward(recordings, bench, state, chosen, count, progress):
             continue
         say(f"without {name}", 0, state.current.chi2_per_sample)
         fewer = actuator.without_effect(name)
-        held = tuple(f"effects.{e.name}.{p}" for e in fewer.effects for p in e.parameters())
         more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra}
-        trial = fit(recordings, bench, actuator=fewer, extra=held, **more)
+        trial = fit(recordings, bench, actuator=fewer, extra=effect_parameters(fewer), **more)
         rise = chi2_of(trial) - chi2_of(state.current)
         if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
             state.steps.remove(step)

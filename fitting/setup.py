@@ -8,7 +8,6 @@ import numpy as np
 
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.extrema import nesting
-from magjax.param import parameters_of
 
 from .density import cell_basis, hat_basis
 from .joint import Problem
@@ -74,6 +73,11 @@ def applied_range(spectra, actuator):
     return min(f.min() for f in fields), max(f.max() for f in fields)
 
 
+def effect_parameters(actuator) -> tuple[str, ...]:
+    """Names of the parameters of an actuator's effects, none for None: what `fit` frees with `extra`."""
+    return tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
+
+
 def free_parameters(bench, actuator, extra=()):
     """Names of the scalar parameters to fit: the bench's, and those of the effects."""
     known = actuator.parameters()
@@ -82,11 +86,6 @@ def free_parameters(bench, actuator, extra=()):
         if name not in known:
             raise ConfigurationError(f'fit.free names "{name}", which this bench does not have; it has {", ".join(known)}')
     return tuple(dict.fromkeys(names))
-
-
-def effect_parameters(effect, actuator):
-    """Full names of an effect's parameters that a fit frees."""
-    return tuple(f"effects.{effect.name}.{p}" for p in parameters_of(effect))
 
 
 def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:

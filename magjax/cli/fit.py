@@ -59,7 +59,7 @@ def run_fit(arguments) -> int:
     folder = output_folder(options.out)
     from fitting.check import check_errors
     from fitting.fit import fit
-    from fitting.setup import Choices
+    from fitting.setup import Choices, effect_parameters
 
     choices = Choices(max_jacobians=options.max_jacobians)
     if options.cells:
@@ -69,9 +69,8 @@ def run_fit(arguments) -> int:
     bench, actuator = _bench_and_start(options)
     recordings = load_recordings(options.recordings, bench)
     checks = load_recordings(options.check, bench) if options.check else []
-    held = tuple(f"effects.{e.name}.{q}" for e in (actuator.effects if actuator else ()) for q in e.parameters())
     with Progress(options.quiet or options.json) as progress:
-        result = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
+        result = fit(recordings, bench, actuator=actuator, extra=effect_parameters(actuator), choices=choices, progress=progress)
         (more, text), stopped = ({}, ""), None
         try:
             more, text = intervals(result, options, folder, progress)
