@@ -1,5 +1,7 @@
 """Suites of concealed benches: what is hidden, how strongly, on which density, with which instruments.
 
+dev and practice are to work on (practice drives at many amplitudes and offsets), val chooses thresholds, test is the proof.
+
 A case follows from its suite and number alone. Labels are told apart from recordings, and their hash per suite stands in
 SEALS.json before a run: `python -m tests.blind.cases seal` writes it, `... write dev 3 FOLDER` writes one case's recordings.
 """
@@ -122,6 +124,8 @@ def make_case(suite: str, number: int) -> Case:
     drives = tuple(
         {"frequency": float(f), "amplitude": float(a), "offset": offset} for f, a in zip(FREQUENCIES, order, strict=True)
     )
+    if suite == "practice":
+        drives = _varied(rng)
     checks = (
         {"frequency": 400.0, "amplitude": 0.6, "offset": offset},
         {"frequency": 20.0, "amplitude": 0.45, "offset": offset, "extra": ((2, 0.3, 1.0), (5, 0.25, 2.0))},
@@ -137,6 +141,16 @@ def make_case(suite: str, number: int) -> Case:
         suite, number, kind, level, effects, str(rng.choice(KINDS)), str(rng.choice(["demagnetized", "negative", "positive"])),
         {k: _round(v) for k, v in truth.items()}, instruments, drives, checks, seed,
     )  # fmt: skip
+
+
+def _varied(rng):
+    """Six to ten sines of as many amplitudes and offsets; the slowest spans the plane."""
+    count = int(rng.integers(6, 11))
+    frequencies = np.sort(rng.choice(FREQUENCIES[1:], count - 1, replace=False))
+    rows = [{"frequency": float(FREQUENCIES[0]), "amplitude": _round(rng.uniform(0.78, 0.85)), "offset": _round(rng.uniform(0, 0.1))}]
+    for f in frequencies:
+        rows.append({"frequency": float(f), "amplitude": _round(rng.uniform(0.2, 0.75)), "offset": _round(rng.uniform(-0.2, 0.2))})
+    return tuple(rows)
 
 
 def _strength(name, value, rng):

@@ -1,17 +1,18 @@
 """Run a suite through the command line: `python -m tests.blind.run dev --out blind-results --workers 2`.
 
-Resumable: a case with done.json is skipped, and with --kept FILE.jsonl (see `score`) one that stands there; every case is a process of its own. One folder a case holds the command's results
-and done.json (exit status, seconds, peak memory); recordings are written, used and removed, for they follow from the case.
+Resumable: a case with done.json is skipped, and with --kept FILE.jsonl (see `score`) one that stands there; every case is a
+process of its own. One folder a case holds the command's results and done.json (exit status, seconds, peak memory);
+recordings are written, used and removed, for they follow from the case.
 """
 
 import argparse
 import concurrent.futures
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def run_case(suite: str, number: int, out: Path, limit: float = 1200.0) -> dict:
     try:
         write_case(case, folder)
     except RuntimeError as error:  # the generator's own failure is told, and the suite goes on
-        ended = {"status": GENERATOR_FAILED, "seconds": 0.0, "peak_MB_so_far": 0, "last": str(error)}
+        ended = {"status": GENERATOR_FAILED, "seconds": 0.0, "peak_MB": 0, "last": str(error)}
     else:
         ended = diagnose(folder, folder / "result", limit)
     part = folder / "done.part"
@@ -43,7 +44,7 @@ def run_case(suite: str, number: int, out: Path, limit: float = 1200.0) -> dict:
 
 
 def diagnose(folder: Path, result: Path, limit: float) -> dict:
-    """The command on a folder of recordings: exit status, seconds, peak memory of the children so far, last words."""
+    """The command on a folder of recordings: exit status, seconds, peak memory, last words."""
     fit, check = sorted(map(str, folder.glob("fit_*.csv"))), sorted(map(str, folder.glob("check_*.csv")))
     command = [sys.executable, "-m", "magjax", "diagnose", *fit, "--bench", str(folder / "bench.toml")]
     command += ["--check", *check] if check else []
@@ -54,16 +55,19 @@ def diagnose(folder: Path, result: Path, limit: float) -> dict:
         "MPLBACKEND": "Agg",
         "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
     }
-    begin = time.time()
-    try:
-        ended = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=limit)
-        status, words, spoken = ended.returncode, ended.stderr, ended.stdout
-    except subprocess.TimeoutExpired:
-        status, words, spoken = -1, f"stopped after {limit:g} s", ""
     result.mkdir(parents=True, exist_ok=True)
-    (result / "stdout.json").write_text(spoken)
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
-    return {"status": status, "seconds": round(time.time() - begin, 1), "peak_MB_so_far": round(memory), "last": words[-400:]}
+    begin, words = time.time(), folder / "stderr.txt"
+    with (result / "stdout.json").open("w") as out, words.open("w") as err:
+        process = subprocess.Popen(command, stdout=out, stderr=err, env=environment)
+        late = threading.Timer(limit, process.kill)
+        late.start()
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        late.cancel()
+    seconds = time.time() - begin
+    last = words.read_text()[-400:] if seconds < limit else f"stopped after {limit:g} s"
+    words.unlink()
+    return {"status": process.returncode, "seconds": round(seconds, 1), "peak_MB": round(used.ru_maxrss / 1e3), "last": last}
 
 
 def main():

@@ -105,7 +105,7 @@ SCORED = ("coil.R_eddy", "mechanics.xi", "mechanics.f0")
 
 def kept_line(name: str, done: dict, diagnosis) -> str:
     """A case's row of --keep: what the score reads of it, figures rounded to six digits."""
-    row = {"name": name, "done": {k: done[k] for k in ("status", "seconds")}, "diagnosis": None}
+    row = {"name": name, "done": {k: done[k] for k in ("status", "seconds", "peak_MB") if k in done}, "diagnosis": None}
     if diagnosis:
         fits = {}
         for key in ("base", "repaired"):
@@ -148,11 +148,12 @@ def coverage(case, diagnosis):
 
 def table(suite: str, rows) -> str:
     """The result table, the confusion matrix and the numbers beside them."""
-    by, closed, covered, seconds, blocks = {}, [], [], [], []
+    by, closed, covered, seconds, memory, blocks = {}, [], [], [], [], []
     for case, diagnosis, done in rows:
         outcome = judge(case, diagnosis, done["status"])
         by.setdefault((case.kind, case.level if case.kind in ("single", "outside", "hidden") else ""), []).append(outcome)
         seconds.append(done["seconds"])
+        memory += [done["peak_MB"]] if "peak_MB" in done else []
         if diagnosis and case.kind in ("single", "pair"):
             closed += gap_closed(diagnosis)
         if diagnosis and (case.kind == "null" or outcome == "right" and case.kind in ("single", "pair")):
@@ -181,6 +182,8 @@ def table(suite: str, rows) -> str:
     if blocks:
         lines.append(f"unknown_at names the right block in {sum(blocks)} of {len(blocks)}.")
     lines.append(f"Time of one diagnosis, compilation included: median {np.median(seconds):.0f} s, longest {max(seconds):.0f} s.")
+    if memory:
+        lines.append(f"Its peak memory ({len(memory)} cases): median {np.median(memory):.0f} MB, highest {max(memory)} MB.")
     return "\n".join([*lines, *_believed(rows), *_by_sight(rows)]) + "\n\n" + confusion(rows)
 
 
