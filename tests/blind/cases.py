@@ -144,8 +144,8 @@ def make_case(suite: str, number: int) -> Case:
 
 
 def _varied(rng):
-    """Six to ten sines of as many amplitudes and offsets; the slowest spans the plane."""
-    count = int(rng.integers(6, 11))
+    """Six to nine sines of as many amplitudes and offsets; the slowest spans the plane."""
+    count = int(rng.integers(6, 10))
     frequencies = np.sort(rng.choice(FREQUENCIES[1:], count - 1, replace=False))
     rows = [{"frequency": float(FREQUENCIES[0]), "amplitude": _round(rng.uniform(0.78, 0.85)), "offset": _round(rng.uniform(0, 0.1))}]
     for f in frequencies:
