@@ -15,6 +15,7 @@ from .spectra import fit_lines, reduce_recording, with_noise
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
 RESTLESS = 5.0  # mean square of the first period between its harmonics over the white noise
+NO_DRIFT = 0.25  # share of the change from the first period to the last that a drift must leave for a transient
 OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record by itself, and the share of records that must show it
 
 
@@ -191,26 +192,25 @@ def remove_from_checks(recordings, adopted, bench):
 
 def data_problem(recordings, spectra, output) -> str | None:
     """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
+    widest = max(s.peak_to_peak for s in spectra)
     for recording, s in zip(recordings, spectra, strict=True):
-        y = _reading(recording, s, output)
         if s.periods >= 2:
-            step = int(s.samples / s.periods)
-            cycles = np.arange(s.samples) * s.dt * s.frequency  # periods need not divide the sampling
-            blocks = np.stack([np.interp(k + np.arange(step) / step, cycles, y) for k in range(s.periods)])
-            first = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))
-            later = float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if s.periods > 2 else 0.0
+            y = _reading(recording, s, output)
+            blocks = _by_period(s, y)
             floor = np.sqrt(2 * s.noise.white)
-            if first > 0.03 * s.peak_to_peak and first > 8 * floor and first > 4 * later:
+            first, later = _changes(blocks)
+            sudden = first > 0.03 * s.peak_to_peak and first > 8 * floor and first > 4 * later
+            if sudden and _changes(_by_period(s, y - drift_of(s)[1]))[0] > NO_DRIFT * first:
                 return (
                     f"{recording.name}: the first period differs from the last by {first:.3g} rms and later ones do not: an unsettled "
                     "transient; cut the first periods or wait before recording"
                 )
             moved = float(np.abs(blocks[-1].mean() - blocks[0].mean()))
-            if moved > 0.05 * s.peak_to_peak and moved > 8 * floor:
+            if moved > 0.05 * widest and moved > 8 * floor:
                 return f"{recording.name}: the reading drifts by {moved:.3g} through the record; let it warm up, or remove the drift first"
     recording, s = min(zip(recordings, spectra, strict=True), key=lambda pair: pair[1].samples * pair[1].dt)
     y = _reading(recording, s, output) - drift_of(s)[1]
-    if s.periods >= 2 and (change := _period_change(s, y)) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
+    if s.periods >= 2 and (change := _changes(_by_period(s, y))[0]) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
         return (
             f"{recording.name}: the periods do not repeat: the last differs from the first by {change:.3g} rms within "
             f"{s.samples * s.dt * 1e3:.3g} ms, and no drift explains it; wait until the reading is settled, then record"
@@ -233,7 +233,7 @@ def _restless(recordings, spectra, output) -> float | None:
         if s.periods >= 2:
             y = _reading(recording, s, output) - drift_of(s)[1]
             left = fit_lines(y, np.arange(s.samples) * s.dt * s.frequency, len(s.reading) - 1)[1]
-            changes.append(_period_change(s, y) / s.peak_to_peak)
+            changes.append(_changes(_by_period(s, y))[0] / s.peak_to_peak)
             risen.append(np.mean(left[: int(s.samples / s.periods)] ** 2) / s.noise.white)
     if not changes or np.median(risen) < RESTLESS or np.mean(np.asarray(changes) > 0.01) < OWN_SHARE:
         return None
@@ -246,12 +246,17 @@ def _reading(recording, s, output):
     return y if s.start is None else y - s.start
 
 
-def _period_change(s, y) -> float:
-    """Rms of the last period less the first."""
+def _by_period(s, y):
+    """The samples period by period, (periods, samples); periods need not divide the sampling."""
     step = int(s.samples / s.periods)
     cycles = np.arange(s.samples) * s.dt * s.frequency
-    first, last = (np.interp(k + np.arange(step) / step, cycles, y) for k in (0, s.periods - 1))
-    return float(np.sqrt(np.mean((first - last) ** 2)))
+    return np.stack([np.interp(k + np.arange(step) / step, cycles, y) for k in range(s.periods)])
+
+
+def _changes(blocks):
+    """Rms of the last period less the first, and less the one before it."""
+    first = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))
+    return first, float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if len(blocks) > 2 else 0.0
 
 
 def wrong_bench(result) -> str | None:

@@ -81,6 +81,18 @@ def test_a_transient_is_a_data_problem(bench):
     assert text is not None and "transient" in text
 
 
+def test_a_drift_by_the_root_of_time_is_no_transient(bench):
+    runs, _ = study(bench)
+    run = runs[1]
+    y = run.channels["displacement"]
+    drifting = y + 0.06 * np.ptp(y) * np.sqrt(run.time / run.time[-1])
+    again = Recording(run.time, {**run.channels, "displacement": drifting}, {}, run.origin, "drifting")
+    (s,) = spectra_of([again], bench)
+    period = int(s.samples / s.periods)
+    assert np.sqrt(np.mean((drifting[:period] - drifting[-period:]) ** 2)) > 0.03 * np.ptp(y)  # by itself it would be one
+    assert data_problem([again], [s], "displacement") is None
+
+
 def test_a_slow_decay_in_every_recording_is_a_data_problem(bench):
     """Ringing off the harmonics for two periods, in every recording: a straight drift and a raised noise must not take it."""
     runs, _ = study(bench)
