@@ -12,6 +12,7 @@ from magjax.bench import load_bench
 
 from .alternation import alternating
 from .attribute import chi2_of
+from .fit import REFINE_BELOW
 from .fit import fit_or_stop as fit
 from .floors import data_problem, record_effects, remove_from_checks, remove_record_effect, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
@@ -25,6 +26,8 @@ from .verdict import ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, 
 
 RECORD_Z = 8.0
 ABSORBED_VISIBILITY = 0.004
+FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave
+UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
 def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choices: Choices = Choices(), progress=None, placebo_runs: int = 0) -> Diagnosis:
@@ -61,7 +64,7 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
         base = fit(recordings, bench, actuator=actuator, extra=free, choices=base_now.choices, progress=progress, refine=False)
     recordings = cleaned
     cleaned_check = remove_from_checks(check, [e for e, _ in adopted], bench)
-    candidates = screened(base_now, choices)
+    base_now, candidates = _screened_finer(recordings, bench, base_now, choices, held if zero is None else (*held, "sensor.offset"), progress)
     place = where(base_now, candidates, recordings, bench.output)
     absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY)
     reached = search(recordings, bench, base_now, candidates, choices, progress, cleaned_check)
@@ -70,7 +73,7 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     )
     found = verdict(evidence)
     if found.verdict == "unknown_at":
-        if _rough(evidence):
+        if _rough(evidence, found.check):
             found = verdict(evidence, rough=True)
         else:
             found = with_learned_term(found, base_now, recordings, bench, cleaned_check, progress)
@@ -92,6 +95,21 @@ def _sensor_zero(recordings, bench, base, actuator, held, choices, progress):
     if freed.chi2_per_sample > SILENT_CHI2:
         return base, None
     return freed, freed.estimate("sensor.offset").value
+
+
+def _screened_finer(recordings, bench, base, choices, held, progress):
+    """The base and its candidates; where none would take half of what is left, a finer density is given a chance first."""
+    candidates = screened(base, choices)
+    best = max((c.z**2 for c in candidates), default=0.0)
+    meant = REFINE_BELOW <= base.chi2_per_sample < UNEXPLAINED and base.choices.knots is not None
+    if not meant or best > 0.5 * (chi2_of(base) - base.data_count):
+        return base, candidates
+    start = base.solution.z[: base.problem.layout.density_unknowns + 1]
+    finer = fit(
+        recordings, bench, actuator=base.actuator, extra=held, choices=base.choices, start=start, refine=UNEXPLAINED, progress=progress,
+        spectra=base.spectra,
+    )  # fmt: skip
+    return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, choices))
 
 
 def _record_level(recordings, spectra, bench, choices):
@@ -116,11 +134,19 @@ def _floors(result) -> dict:
     return {"noise_rms": noise, "solver_rms": solver_floor(result.problem, result.solution), "density_rms": float(noise * np.sqrt(above))}
 
 
-def _rough(evidence) -> bool:
-    """Whether what is left is the density's: little, nothing scores beyond what a rough one leaves, and nothing earned its place.
+def _rough(evidence, checks) -> bool:
+    """Whether what is left is the density's: little, and nothing scores beyond what a rough one leaves and nothing earned its
+    place; or a finer density was asked for and what is named foretells the check recordings, which took no part.
 
     A smooth function could always be learned from it, and would be no physics.
     """
-    highest = max((abs(c.z) for c in evidence.candidates), default=0.0)
-    nothing = not evidence.reached.steps and highest < SECOND_Z or too_little(evidence.reached, evidence.plain)
-    return bool(nothing) and evidence.excess < ROUGH_CHI2
+    if not evidence.excess < ROUGH_CHI2:
+        return False
+    steps, current = evidence.reached.steps, evidence.reached.current
+    if not steps:
+        return max((abs(c.z) for c in evidence.candidates), default=0.0) < SECOND_Z
+    if too_little(evidence.reached, evidence.plain):
+        return True
+    finer = current.choices.knots is not None and current.choices.knots[0] > Choices().knots[0]
+    before, after = (sum(max((r[k] / r["noise_rms"]) ** 2 - 1, 0.0) for r in checks) for k in ("rms_before", "rms_after"))
+    return finer and before > len(checks) and after < FORETOLD * before

@@ -16,8 +16,9 @@ from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 FINER_KNOTS = ((26, 18), (36, 24))
-FINER_TAKES = 0.7  # of the excess may be left
-REFINE_BETWEEN = (1.05, 8.0)  # chi2/N: below nothing is to gain, above it is physics that is missing
+FINER_FROM = (1.05, 1.5)  # chi2/N from which each is tried,
+FINER_TAKES = (0.7, 0.5)  # and the share of the excess that it may leave
+REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
 REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be the density
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
@@ -25,12 +26,12 @@ VALLEY = 0.98  # correlation from which two parameters are one
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
-def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool = True, start=None, target: float = np.inf, spectra=None) -> FitResult:
+def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool | float = True, start=None, target: float = np.inf, spectra=None) -> FitResult:
     """Fit an actuator to recordings jointly.
 
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
-    of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it; `progress`:
-    called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early;
+    of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it, or up to what chi2/N;
+    `progress`: called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early;
     `spectra`: those of the recordings, where another fit of the same has them.
     Returns a `FitResult`; raises `RecordingError` where a recording cannot be used and `ConfigurationError` for a wrong
     bench. Non-convergence is a result, not an exception.
@@ -53,7 +54,9 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
     if refine and choices.knots is not None and not solution.interrupted:
-        problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report)
+        highest = REFINE_MATERIAL if bench.drive == "field" else REFINE_BESIDE if actuator.effects else REFINE_BELOW
+        highest = highest if refine is True else refine
+        problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report, highest)
     return dataclasses.replace(finish(problem, solution, choices, bench, recordings, warm), history=tuple(history))
 
 
@@ -114,20 +117,20 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
     return best[:3]
 
 
-def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report):
-    """Finer hats where chi2 stays above the noise and they lower it clearly."""
+def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report, highest):
+    """Finer hats where chi2 stays above the noise, chi2/N below `highest`, and they lower it clearly."""
     count = problem.data_count
-    for knots in FINER_KNOTS:
-        beside = REFINE_BESIDE if actuator.effects else REFINE_BETWEEN[1]
-        highest = REFINE_MATERIAL if bench.drive == "field" else beside
-        if not REFINE_BETWEEN[0] < solution.chi2 / count < highest:
+    for knots, least, takes in zip(FINER_KNOTS, FINER_FROM, FINER_TAKES, strict=True):
+        if choices.knots[0] >= knots[0]:
+            continue
+        if not least < solution.chi2 / count < highest:
             break
         finer = dataclasses.replace(choices, knots=knots, level=max(choices.level, 4 * knots[0]))
         started = _resample(problem, solution, spectra, actuator, bench, names, finer)
         trial_problem, z = started
         z = _with_parameters(trial_problem, z, problem, solution)
-        # a finer density must take 30 % of the excess, and five standard deviations
-        target = min(0.95 * count + FINER_TAKES * max(solution.chi2 - 0.95 * count, 0.0), solution.chi2 - 25)
+        # a finer density must take its share of the excess, and five standard deviations
+        target = min(0.95 * count + takes * max(solution.chi2 - 0.95 * count, 0.0), solution.chi2 - 25)
         trial = solve(
             trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, target=target,
             progress=lambda k, c: report("finer density", k, c),

@@ -99,12 +99,11 @@ def evidence_weights(layout: Layout, z, normal, weights):
     S[np.ix_(inside, inside)] = np.linalg.inv(free + 1e-12 * np.diag(np.diag(free)))
     new = []
     for weight, D in zip(weights, layout.penalties, strict=True):
-        D = np.asarray(D)
+        D = csr_array(np.asarray(D))
         roughness = float(np.sum((D @ z[:n]) ** 2))
         D = D[:, active[:n]]
-        rank = structural_rank(csr_array(D))
-        taken = weight * np.einsum("ij,jk,ik->", D, S[:n, :n][np.ix_(active[:n], active[:n])], D)
-        gamma = max(rank - taken, 0.5)
+        taken = weight * D.multiply(D @ S[:n, :n][np.ix_(active[:n], active[:n])]).sum()
+        gamma = max(structural_rank(D) - taken, 0.5)
         new.append(np.clip(gamma / max(roughness, 1e-12), *WEIGHT_RANGE))
     return np.asarray(new)
 

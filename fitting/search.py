@@ -27,7 +27,7 @@ from .attribute import (
     try_effect,
 )
 from .check import check_errors
-from .fit import REFINE_BESIDE, REFINE_BETWEEN, REST_SETTLED, RESTS_IN_ORDER
+from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, RESTS_IN_ORDER
 from .fit import fit_or_stop as fit
 from .screen import screen
 from .setup import effect_parameters
@@ -201,11 +201,12 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress, any
     later = chosen.rest != RESTS_IN_ORDER[0]
     if any_rest and bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
         free = dataclasses.replace(chosen, rest="auto")
-        other = fit(recordings, bench, choices=free, refine=False, **more)
+        start = best.result.solution.z[: best.result.problem.layout.density_unknowns + 1]
+        other = fit(recordings, bench, choices=free, refine=False, start=start, **more)
         margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
         if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices
-    if chosen.knots is not None and REFINE_BETWEEN[0] < best.result.chi2_per_sample < REFINE_BESIDE:
+    if chosen.knots is not None and FINER_FROM[0] < best.result.chi2_per_sample < REFINE_BESIDE:
         found = fit(recordings, bench, choices=found, refine=True, **more).choices
     if found == chosen:
         return best, good, chosen

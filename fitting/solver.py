@@ -98,7 +98,11 @@ def damped_step(normal, gradient, y, damping, nonnegative):
 def jacobian(fn, y, chunk: int = CHUNK):
     """The dense Jacobian of fn at y, (residuals, unknowns), in chunks of columns."""
     _, push = jax.linearize(fn, y)
-    return jax.lax.map(push, jnp.eye(y.shape[0]), batch_size=chunk).T
+    n = y.shape[0]
+    chunks = -(-n // chunk)
+    chunk = -(-n // chunks)  # all of one size: a smaller rest would be compiled once more
+    rows = jax.lax.map(jax.vmap(push), jnp.eye(chunks * chunk, n).reshape(chunks, chunk, n))
+    return rows.reshape(chunks * chunk, -1)[:n].T
 
 
 def normal_equations(fn, y, residual):

@@ -22,6 +22,7 @@ HALF = 0.5  # of the excess over NULL_CHI2 must be taken where the repair all bu
 NULL_CHI2 = 0.95
 ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
+ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 
 
@@ -157,8 +158,10 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         groups.append(["sensor_lag", "second_mode"])
     asked = instrument_request({"source", "sensor"} if evidence.command_only else {"sensor"}) if swap else None
     if groups:
-        return _grouped(evidence, common, effects, groups, rivals, swap, asked)
-    return _attributed(evidence, common, effects, swap, asked)
+        found = _grouped(evidence, common, effects, groups, rivals, swap, asked)
+    else:
+        found = _attributed(evidence, common, effects, swap, asked)
+    return dataclasses.replace(found, message=found.message + ROUGH_TEXT) if rough else found
 
 
 def _found(evidence):
@@ -188,7 +191,7 @@ def _silent(evidence, common, dropped, rough) -> Diagnosis:
         earned = "earned its place" if rough else f"scores above {Z_THRESHOLD}"
         text += f"no effect of the catalogue {earned} (highest: {highest})."
     if rough:
-        text += " What is left above the noise is a density rougher than the fit's, most likely."
+        text += ROUGH_TEXT
     if evidence.absorbed:
         text += f" These recordings could not show {', '.join(evidence.absorbed)}: the density absorbs them."
     return Diagnosis("nothing_missing", text, **common)

@@ -9,6 +9,7 @@ import pytest
 from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of
 from fitting.screen import Candidate
 from fitting.search import Reached
+from fitting.setup import Choices
 from fitting.verdict import too_little
 
 COUNT = 700
@@ -89,11 +90,11 @@ def test_what_takes_less_than_half_of_the_rest_is_not_named(base, after, named):
 )  # fmt: skip
 def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, held, found, chi2n, taken):
     import fitting.search as module
-    from fitting.setup import Choices
     from magjax.bench import load_bench
 
     best = trial("second_mode", 1.0)
     best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
+    best.result.solution, best.result.problem = SimpleNamespace(z=np.zeros(9)), SimpleNamespace(layout=SimpleNamespace(density_unknowns=4))
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
     monkeypatch.setattr(module, "fit", lambda *a, choices, **k: other if choices.rest == "auto" else pytest.fail("not asked"))
     again = []
@@ -114,4 +115,18 @@ def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
 
     plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
     evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=(candidate("creep", z),), excess=chi2n)
-    assert _rough(evidence) == rough
+    assert _rough(evidence, ()) == rough
+
+
+@pytest.mark.parametrize(
+    ("knots", "after", "rough"), [((26, 18), 6e-8, True), ((26, 18), 1.5e-7, False), ((18, 13), 6e-8, False)],
+    ids=["a rough density", "checks not foretold", "a smooth density"],
+)  # fmt: skip
+def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(knots, after, rough):
+    from fitting.diagnose import _rough
+
+    plain = SimpleNamespace(chi2_per_sample=1.8, data_count=COUNT)
+    current = SimpleNamespace(chi2_per_sample=1.4, data_count=COUNT, choices=Choices(knots=knots))
+    evidence = SimpleNamespace(reached=Reached(current, [(trial("creep", 1.4), [], [], plain)], {}), plain=plain, candidates=(candidate("creep", 12.0),), excess=1.4)
+    rows = [{"rms_before": 2e-7, "rms_after": after, "noise_rms": 5e-8}]
+    assert _rough(evidence, rows) == rough
