@@ -1,5 +1,6 @@
-"""Attribution: the leaders of the screening are fitted for real, from scratch, and must earn their place.
+"""Attribution: the leaders of the screening are fitted for real and must earn their place.
 
+Each fit goes on from the density of the base: from scratch it ends no better, and on a fine density far worse at times.
 A candidate is credited with what it gains beyond the base fitted again from the same start (the placebo), must explain
 its share of the excess misfit, and must have a physical sign. Rivals that end within a few units of chi2 of the best,
 or whose directions coincide, cannot be told apart and form a group.
@@ -30,7 +31,7 @@ MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apar
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """One candidate fitted from scratch: its fit, what it gained beyond the placebo, whether its sign is physical."""
+    """One candidate fitted: its fit, what it gained beyond the placebo, whether its sign is physical."""
 
     candidate: Candidate
     result: object
@@ -86,8 +87,8 @@ def _alike(a: Candidate, b: Candidate) -> float:
     return abs(float(a.direction @ b.direction))
 
 
-def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None, warm: bool = False, target: float = np.inf) -> Trial:
-    """Fit base + effect from scratch, started at the screening's amplitude; `warm`: from the density of the base.
+def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None, target: float = np.inf) -> Trial:
+    """Fit base + effect, started at the screening's amplitude and from the density of the base.
 
     `target`: a chi2 that it must come near to be of use.
     """
@@ -96,9 +97,8 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     amplitude = float(np.clip(candidate.amplitude, -reach, reach))
     effect = effect_class(**candidate.shapes).with_amplitude(amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale)
     actuator = base.actuator.with_effect(effect)
-    start = base.solution.z[: base.problem.layout.density_unknowns + 1] if warm and choices.knots == base.choices.knots else None
     result = fit(
-        recordings, bench, actuator=actuator, start=start, extra=effect_parameters(actuator), choices=choices, refine=False, progress=progress,
+        recordings, bench, actuator=actuator, start=base, extra=effect_parameters(actuator), choices=choices, refine=False, progress=progress,
         target=target, spectra=base.spectra,
     )  # fmt: skip
     return _credited(candidate, result, base, effect, excess)
@@ -109,9 +109,8 @@ def settled(recordings, bench, base, trial, excess, progress=None, target: float
     result = trial.result
     if result.converged or not chi2_of(result) < target:
         return trial
-    start = result.solution.z[: result.problem.layout.density_unknowns + 1]
     result = fit(
-        recordings, bench, actuator=result.actuator, start=start, extra=effect_parameters(result.actuator), choices=result.choices, refine=False,
+        recordings, bench, actuator=result.actuator, start=result, extra=effect_parameters(result.actuator), choices=result.choices, refine=False,
         progress=progress, target=target, spectra=base.spectra,
     )  # fmt: skip
     return _credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)

@@ -104,9 +104,8 @@ def _screened_finer(recordings, bench, base, choices, held, progress):
     meant = REFINE_BELOW <= base.chi2_per_sample < UNEXPLAINED and base.choices.knots is not None
     if not meant or best > 0.5 * (chi2_of(base) - base.data_count):
         return base, candidates
-    start = base.solution.z[: base.problem.layout.density_unknowns + 1]
     finer = fit(
-        recordings, bench, actuator=base.actuator, extra=held, choices=base.choices, start=start, refine=UNEXPLAINED, progress=progress,
+        recordings, bench, actuator=base.actuator, extra=held, choices=base.choices, start=base, refine=UNEXPLAINED, progress=progress,
         spectra=base.spectra,
     )  # fmt: skip
     return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, choices))

@@ -11,7 +11,7 @@ from magjax.simulate import require_x64
 
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
-from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
+from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, goes_on, spectra_of
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
@@ -32,7 +32,8 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
     of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it, or up to what chi2/N;
     `progress`: called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early;
-    `spectra`: those of the recordings, where another fit of the same has them.
+    `spectra`: those of the recordings, where another fit of the same has them; `start`: a fit whose density and weights are
+    gone on from.
     Returns a `FitResult`; raises `RecordingError` where a recording cannot be used and `ConfigurationError` for a wrong
     bench. Non-convergence is a result, not an exception.
     """
@@ -88,7 +89,7 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
 
         def one(say):
             known, z = build_problem(spectra, actuator, bench, names, tried, start) if posed is None else posed
-            weights = START_WEIGHTS[: len(known.layout.penalties)]
+            weights = start.solution.weights if goes_on(start, known.layout.density_unknowns) else START_WEIGHTS[: len(known.layout.penalties)]
             found = solve(known, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: say("fit", k, c))
             return known, found, tried
 

@@ -56,7 +56,7 @@ class Reached:
 
 
 def search(recordings, bench, base, candidates, choices, progress, check=()) -> Reached:
-    """Forward: fit the leaders from scratch, adopt the best while it earns its place; then screen again."""
+    """Forward: fit the leaders, adopt the best while it earns its place; then screen again."""
     count = base.data_count
     state = Reached(base, [], {})
     chosen = base.choices  # the density chosen for the base may be finer than the default: rivals get the same
@@ -68,7 +68,7 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
         excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
-        trials = _trials((recordings, bench, state.current), top, candidates, chosen, excess, bool(state.steps), progress)
+        trials = _trials((recordings, bench, state.current), top, candidates, chosen, excess, progress)
         state.tried.update({t.name: t.candidate for t in trials})
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
         if not good:
@@ -89,7 +89,7 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
     return state
 
 
-def _trials(asked, top, candidates, chosen, excess, warm, progress) -> list[Trial]:
+def _trials(asked, top, candidates, chosen, excess, progress) -> list[Trial]:
     """The leaders fitted, two side by side, until one meets the noise; then the family of the best.
 
     `asked`: recordings, bench, and the fit beside which they are tried.
@@ -102,7 +102,7 @@ def _trials(asked, top, candidates, chosen, excess, warm, progress) -> list[Tria
         return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
 
     def begun(c, target):
-        return lambda say: try_effect(*asked, c, classes[c.name], chosen, excess, say, warm, target)
+        return lambda say: try_effect(*asked, c, classes[c.name], chosen, excess, say, target)
 
     def ended(t, target):
         return lambda say: settled(*asked, t, excess, say, target)
@@ -156,7 +156,7 @@ def _backward(recordings, bench, state, chosen, count, progress):
             continue
         say(f"without {name}", 0, state.current.chi2_per_sample)
         fewer = actuator.without_effect(name)
-        more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra}
+        more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra, "start": state.current}
         trial = fit(recordings, bench, actuator=fewer, extra=effect_parameters(fewer), **more)
         rise = chi2_of(trial) - chi2_of(state.current)
         if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
@@ -201,8 +201,7 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress, any
     later = chosen.rest != RESTS_IN_ORDER[0]
     if any_rest and bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
         free = dataclasses.replace(chosen, rest="auto")
-        start = best.result.solution.z[: best.result.problem.layout.density_unknowns + 1]
-        other = fit(recordings, bench, choices=free, refine=False, start=start, **more)
+        other = fit(recordings, bench, choices=free, refine=False, start=best.result, **more)
         margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
         if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices

@@ -94,7 +94,6 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
 
     best = trial("second_mode", 1.0)
     best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
-    best.result.solution, best.result.problem = SimpleNamespace(z=np.zeros(9)), SimpleNamespace(layout=SimpleNamespace(density_unknowns=4))
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
     monkeypatch.setattr(module, "fit", lambda *a, choices, **k: other if choices.rest == "auto" else pytest.fail("not asked"))
     again = []
