@@ -36,7 +36,7 @@ from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
-NEAR_RIVAL, MOST_RIVALS = 0.3, 3  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
+NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
