@@ -22,7 +22,7 @@ from .placebo import placebo
 from .screen import offset_score
 from .search import SECOND_Z, screened, search
 from .setup import Choices, effect_parameters, spectra_of
-from .verdict import ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, too_little, verdict
+from .verdict import ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
 
 RECORD_Z = 8.0
 ABSORBED_VISIBILITY = 0.004
@@ -147,5 +147,5 @@ def _rough(evidence, checks) -> bool:
     if too_little(evidence.reached, evidence.plain):
         return True
     finer = current.choices.knots is not None and current.choices.knots[0] > Choices().knots[0]
-    before, after = (sum(max((r[k] / r["noise_rms"]) ** 2 - 1, 0.0) for r in checks) for k in ("rms_before", "rms_after"))
-    return finer and before > len(checks) and after < FORETOLD * before
+    before = misfit(checks, "rms_before")
+    return finer and before > len(checks) and misfit(checks, "rms_after") < FORETOLD * before

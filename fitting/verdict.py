@@ -1,6 +1,6 @@
 """The verdict: what the search has reached, in one of six words and two or three plain sentences.
 
-Order: what no repair meets is `unknown_at`; a repair that foretells every check recording worse is not named; where nothing
+Order: what no repair meets is `unknown_at`; a repair that foretells the check recordings worse is not named; where nothing
 earned its place the diagnosis is silent; what has rivals is a group, with the recording that tells them apart; the rest is
 attributed. Data problems are told before any of this (`floors`).
 """
@@ -22,6 +22,8 @@ HALF = 0.5  # of the excess over NULL_CHI2 must be taken where the repair all bu
 NULL_CHI2 = 0.95
 ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
+FULLER_SHARE = 0.99  # where more is left than a rough density would leave
+WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 
@@ -113,6 +115,11 @@ class Evidence:
         return self.bench.drive == "current" and not measured
 
 
+def misfit(rows, which: str) -> float:
+    """Of check recordings above their noise: the sum of (rms / noise)^2 - 1. `which`: "rms_before" or "rms_after"."""
+    return sum(max((r[which] / (r["noise_rms"] or r["rms_before"])) ** 2 - 1, 0.0) for r in rows)
+
+
 def least_excess(result) -> float:
     """chi2/N above which a fit is not at its noise."""
     return SILENT_CHI2 + 3 * np.sqrt(2 / result.data_count)
@@ -144,11 +151,12 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
         "candidates": tuple(tried.get(c.name, c) for c in evidence.candidates), "repaired": current if steps or evidence.adopted else None,
     }  # fmt: skip
-    if evidence.missing and not rough and (not steps or evidence.share < FULL_SHARE or evidence.excess > FAR_FROM_NOISE):
+    full = FULL_SHARE if evidence.excess < ROUGH_CHI2 else FULLER_SHARE
+    if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         return _unknown(evidence, common)
-    worse = [r for r in rows if r["rms_after"] > 1.05 * r["rms_before"] and r["rms_after"] > 1.3 * r["noise_rms"]]
-    if steps and rows and len(worse) == len(rows):  # a repair that predicts nothing better is not physics
-        return _unknown(evidence, common, " The repair that fits best predicts every check recording worse, so it is not named.")
+    before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
+    if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
+        return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
     effects, groups, rivals = _found(evidence)
     if not effects and not groups:
         return _silent(evidence, common, dropped, rough)

@@ -129,3 +129,24 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
     evidence = SimpleNamespace(reached=Reached(current, [(trial("creep", 1.4), [], [], plain)], {}), plain=plain, candidates=(candidate("creep", 12.0),), excess=1.4)
     rows = [{"rms_before": 2e-7, "rms_after": after, "noise_rms": 5e-8}]
     assert _rough(evidence, rows) == rough
+
+
+@pytest.mark.parametrize(
+    ("chi2n", "after", "word"),
+    [(1.0, (1.05, 1.1), "attributed"), (1.0, (1.3, 4.0), "unknown_at"), (2.0, (1.05, 1.1), "attributed"), (5.0, (1.05, 1.1), "unknown_at")],
+    ids=["foretells", "foretells worse", "a little left", "much left"],
+)
+def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, chi2n, after, word):
+    """One of two check recordings may get better and the other far worse: together they are worse."""
+    import fitting.verdict as module
+
+    rows = [{"file": "c", "unit": "m", "rms_before": b * 4e-8, "rms_after": a * 4e-8, "noise_rms": 4e-8} for b, a in zip((1.4, 2.0), after, strict=True)]
+    monkeypatch.setattr(module, "check_errors", lambda *a: rows)
+    monkeypatch.setattr(module, "exchange", lambda *a: None)
+    monkeypatch.setattr(module, "_found", lambda e: ([{"name": "creep", "block": "mechanics"}], [], []))
+    plain = SimpleNamespace(chi2_per_sample=220.0, data_count=COUNT, actuator=None)
+    current = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=None)
+    reached = Reached(current, [(trial("creep", chi2n, base=220.0), [], [], plain)], {})
+    where = {"by_block": {"mechanics": 1.0}, "by_field": []}
+    evidence = module.Evidence(reached, (), plain, plain, (), (), SimpleNamespace(drive="current"), (["check"], ["check"]), {}, where, ())
+    assert module.verdict(evidence).verdict == word
