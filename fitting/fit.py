@@ -11,7 +11,7 @@ from magjax.simulate import require_x64
 
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
-from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, goes_on, spectra_of
+from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
@@ -50,7 +50,7 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
         if progress is not None:
             progress(text, step, chi2)
 
-    problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), start)
+    problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), _density(start))
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
@@ -80,6 +80,11 @@ def _rests(bench, choices):
     return (RESTS[bench.start],) if bench.start in RESTS else RESTS_IN_ORDER
 
 
+def _density(start):
+    """Density unknowns and bottom of a fit, None for None."""
+    return None if start is None else start.solution.z[: start.problem.layout.density_unknowns + 1]
+
+
 def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):
     """The fit from each start memory until one meets the noise; the best of them. The first by itself, then the others side by side."""
     rests = _rests(bench, choices)
@@ -88,8 +93,9 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
         tried = dataclasses.replace(choices, rest=rest)
 
         def one(say):
-            known, z = build_problem(spectra, actuator, bench, names, tried, start) if posed is None else posed
-            weights = start.solution.weights if goes_on(start, known.layout.density_unknowns) else START_WEIGHTS[: len(known.layout.penalties)]
+            known, z = build_problem(spectra, actuator, bench, names, tried, _density(start)) if posed is None else posed
+            same = start is not None and start.problem.layout.density_unknowns == known.layout.density_unknowns
+            weights = start.solution.weights if same else START_WEIGHTS[: len(known.layout.penalties)]
             found = solve(known, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: say("fit", k, c))
             return known, found, tried
 

@@ -89,8 +89,8 @@ def free_parameters(bench, actuator, extra=()):
 
 
 def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
-    """The problem and its starting vector. `start`: a fit whose density is gone on from where it has the same hats, else the
-    equation error decides."""
+    """The problem and its starting vector. `start`: density unknowns and bottom to go on from, left aside where there are not as
+    many; else equation error."""
     low, high = applied_range(spectra, actuator)
     margin = PLANE_MARGIN * (high - low)
     total = float(actuator.magnetostriction.M_s) if actuator.magnetostriction is not None else _total_from(spectra, bench)
@@ -110,11 +110,9 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         # field-driven benches differ by decades: find the scale first
         found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
         actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})
-    if goes_on(start, basis.cells.shape[1]):
-        first = start.solution.z[: basis.cells.shape[1] + 1]
-    else:
+    if start is None or len(start) != basis.cells.shape[1] + 1:
         x, bottom, _ = equation_error_start(basis, spectra, full, starter, jax.jit(bounded_step), rest=rest)
-        first = np.append(x, bottom)
+        start = np.append(x, bottom)
     known = actuator.parameters()
     values = [float(known[n][0]) for n in names]
     infos = [known[n][1] for n in names]
@@ -139,12 +137,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         jnp.asarray(rows), jnp.asarray(shares),
     )  # fmt: skip
     problem = Problem(layout, make_start_actuator(actuator, basis, rest), predictors, target, tuple(spectra), _quasistatic(bench))
-    return problem, np.concatenate([first, np.zeros(len(names) + memories)])
-
-
-def goes_on(start, unknowns: int) -> bool:
-    """Whether there is a fit to start from, with as many density unknowns."""
-    return start is not None and start.problem.layout.density_unknowns == unknowns
+    return problem, np.concatenate([start, np.zeros(len(names) + memories)])
 
 
 def _quasistatic(bench) -> bool:

@@ -143,6 +143,21 @@ class FieldKink(AbstractEffect):
         return {}
 
 
+def test_a_term_is_fitted_jointly_with_the_density():
+    """The place is given; that it is found, and the whole verdict, is the long test below."""
+    from fitting.fit import fit
+    from fitting.learned import fit_term
+    from fitting.setup import Choices
+
+    bench = load_bench("aa-050h")
+    rng = np.random.default_rng(3)
+    runs = [record(concealed_actuator(bench, FieldKink()), *d, rng, f"r{d[0]}") for d in ((10, 0.8, 0.1), (80, 0.5, 0.1), (200, 0.8, 0.1))]
+    base = fit(runs, bench, choices=Choices(fine=250, max_jacobians=12, rest="negative"), refine=False)
+    term = LearnedTerm.null("magnetostriction", ("field",), [1e3], [2.4e4], (16,), prior_deviations((16,), 0.2), 1e-7)
+    learned = fit_term(base, Place("magnetostriction", ("field",), 100.0, 0.9, 0.2, 1e-7, 0.1, term), runs, bench)
+    assert learned.share > 0.6 and learned.result.chi2_per_sample < 0.7 * base.chi2_per_sample
+
+
 @pytest.mark.long
 def test_an_effect_outside_the_catalogue_is_placed_and_modelled(tmp_path):
     from fitting.diagnose import diagnose
