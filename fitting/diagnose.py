@@ -22,7 +22,7 @@ from .placebo import placebo
 from .screen import offset_score
 from .search import SECOND_Z, screened, search
 from .setup import Choices, effect_parameters, spectra_of
-from .verdict import ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
+from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
 
 RECORD_Z = 8.0
 ABSORBED_VISIBILITY = 0.004
@@ -135,7 +135,8 @@ def _floors(result) -> dict:
 
 def _rough(evidence, checks) -> bool:
     """Whether what is left is the density's: little, and nothing scores beyond what a rough one leaves and nothing earned its
-    place; or a finer density was asked for and what is named foretells the check recordings, which took no part.
+    place; or a finer density was asked for and what is named foretells the check recordings, which took no part
+    (without any, it must explain all but a little).
 
     A smooth function could always be learned from it, and would be no physics.
     """
@@ -147,5 +148,7 @@ def _rough(evidence, checks) -> bool:
     if too_little(evidence.reached, evidence.plain):
         return True
     finer = current.choices.knots is not None and current.choices.knots[0] > Choices().knots[0]
+    if not checks:
+        return finer and evidence.share > FULL_SHARE
     before = misfit(checks, "rms_before")
     return finer and before > len(checks) and misfit(checks, "rms_after") < FORETOLD * before

@@ -22,7 +22,7 @@ HALF = 0.5  # of the excess over NULL_CHI2 must be taken where the repair all bu
 NULL_CHI2 = 0.95
 ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
-FULLER_SHARE = 0.99  # where more is left than a rough density would leave
+CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: right effects on smooth densities leave less
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
@@ -151,7 +151,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
         "candidates": tuple(tried.get(c.name, c) for c in evidence.candidates), "repaired": current if steps or evidence.adopted else None,
     }  # fmt: skip
-    full = FULL_SHARE if evidence.excess < ROUGH_CHI2 else FULLER_SHARE
+    full = FULL_SHARE if evidence.excess < CLEAN_CHI2 else FULLER_SHARE
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         return _unknown(evidence, common)
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
