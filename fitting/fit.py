@@ -11,7 +11,7 @@ from magjax.simulate import require_x64
 
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
-from .setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
+from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
@@ -50,6 +50,7 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
         if progress is not None:
             progress(text, step, chi2)
 
+    start = None if start is not None and _changes_scale(bench, names, start) else start
     problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), _density(start))
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
@@ -78,6 +79,11 @@ def _rests(bench, choices):
     if choices.rest != "auto":
         return (choices.rest,)
     return (RESTS[bench.start],) if bench.start in RESTS else RESTS_IN_ORDER
+
+
+def _changes_scale(bench, names, start) -> bool:
+    """Whether a first eddy loss is asked for where the field is known: the density learned without it holds its width."""
+    return bench.drive == "field" and EDDY_EFFECT in names and EDDY_EFFECT not in start.problem.layout.names
 
 
 def _density(start):

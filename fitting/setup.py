@@ -106,7 +106,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
     full = [line_deviations(s, s.noise) for s in spectra]
     starter = actuator  # its coil holds all of the eddy loss, for the equation error
-    for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" else ():
+    for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" and start is None else ():
         # field-driven benches differ by decades: find the scale first
         found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
         actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from fitting.check import check_errors
+from fitting.diagnose import diagnose
 from fitting.fit import fit
 from magjax.bench import load_bench
+from magjax.effects import CATALOGUE
 from magjax.recording import load_recordings
 
 
@@ -35,3 +37,46 @@ def test_a_loop_left_out_is_predicted(measured, family, left_out, share):
     found = fit(kept, bench)
     row = check_errors(found.actuator, found.actuator, [runs[left_out]], bench)[0]
     assert row["rms_after"] < share * np.std(runs[left_out].channels["flux_density"])
+
+
+RATES = {"coil", "source", "mechanics", "sensor"} | {"magnetic_aftereffect", "rate_dependent_switching", "creep", "field_diffusion"}
+
+
+def claimed(found):
+    """Names of what a diagnosis says is or may be missing."""
+    return {e["name"] for e in found.effects} | {n for g in found.groups for n in g}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("frequencies", [(10, 50), (10, 20, 50)])
+def test_concealed_eddy_currents_of_the_rod_are_found(measured, frequencies):
+    bench = load_bench("rod-eddy")
+    bench = dataclasses.replace(bench, free=tuple(n for n in bench.free if n != "coil.k_eddy"))
+    every = {f: load_recordings([str(measured / f"rod_eddy/captures_f0{f}.csv")], bench)[0] for f in (10, 20, 50)}
+    check = [r for f, r in every.items() if f not in frequencies]
+    concealed = bench.actuator().replace({"coil.k_eddy": 0.0})
+    found = diagnose([every[f] for f in frequencies], bench, check=check, actuator=concealed)
+    assert "eddy_currents" in claimed(found), str(found)
+    if check:
+        (effect,) = found.effects
+        k = effect["parameters"]["k"]
+        assert abs(k["value"] - 0.053) < 0.004 and 3e-4 < k["stderr"] < 3e-3
+        assert found.check[0]["rms_after"] < 0.75 * found.check[0]["rms_before"]
+
+
+@pytest.mark.long
+def test_nothing_is_missing_where_the_eddy_currents_are_in_the_base(measured):
+    bench = load_bench("rod-eddy")
+    runs = load_recordings([str(measured / f"rod_eddy/captures_f0{f}.csv") for f in (10, 20, 50)], bench)
+    found = diagnose(runs, bench)
+    assert found.verdict == "nothing_missing", str(found)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("family", ["steel_m130_27s", "ferrite_mnzn"])
+def test_nothing_that_depends_on_rate_is_claimed_of_quasistatic_loops(measured, family):
+    bench = load_bench("material-loops")
+    runs = load_recordings([str(measured / family / "loops.csv")], bench)
+    found = diagnose(runs, bench)
+    blocks = {c.name: c.block for c in CATALOGUE}
+    assert not {n for n in claimed(found) if n in RATES or blocks[n] in RATES}, str(found)
