@@ -25,6 +25,7 @@ BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
 WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
 SAME_DIRECTION = 0.97
+OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law imitates another
 MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
 MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart
 
@@ -121,13 +122,19 @@ def _credited(candidate, result, base, effect, excess) -> Trial:
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
     drop = chi2_of(base) - chi2_of(result)
-    physical = all(
-        result.estimate(f"effects.{e.name}.{e.amplitude}").value >= 0 for e in result.actuator.effects if e.parameters()[e.amplitude].low >= 0
-    )
+    physical = all(_physical(e, result) for e in result.actuator.effects)
     number = len(effect.parameters())
     extra = number * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
     return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), number)
+
+
+def _physical(effect, result) -> bool:
+    """Whether an effect's amplitude has a sign and a size that it can have; one that ends in a bound of its own may run on."""
+    info = effect.parameters()[effect.amplitude]
+    amplitude = result.estimate(f"effects.{effect.name}.{effect.amplitude}").value
+    largest = OUT_OF_REACH * max(map(abs, info.typical)) if info.typical and np.isinf(info.high) else np.inf
+    return abs(amplitude) <= largest and (amplitude >= 0 or info.low < 0)
 
 
 def rivals_of(best: Trial, trials) -> list[Trial]:

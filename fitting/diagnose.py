@@ -26,7 +26,7 @@ from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis
 
 RECORD_Z = 8.0
 ABSORBED_VISIBILITY = 0.004
-FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave
+FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -150,5 +150,6 @@ def _rough(evidence, checks) -> bool:
     finer = current.choices.knots is not None and current.choices.knots[0] > Choices().knots[0]
     if not checks:
         return finer and evidence.share > FULL_SHARE
-    before = misfit(checks, "rms_before")
-    return finer and before > len(checks) and misfit(checks, "rms_after") < FORETOLD * before
+    before, after = ([misfit([row], which) for row in checks] for which in ("rms_before", "rms_after"))
+    left = [a / b for a, b in zip(after, before, strict=True) if b > 1]  # of those that leave something to foretell
+    return finer and sum(before) > len(checks) and sum(after) < FORETOLD * sum(before) and bool(np.median(left) < FORETOLD)

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 WIDEN = 1.3  # stated errors are widened by this: the evidence weights take the roughness for granted
+WIDEN_BESIDE = 2.6  # the same beside an effect: its law's form is taken for granted too
 UNDERSMOOTH = 0.1  # parameters are quoted with a tenth of the roughness weights
 
 
@@ -45,13 +46,14 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
     """Every declared parameter of the fitted actuator with its error."""
     layout = problem.layout
     cov = covariance(solution.normal, solution.z, layout.density_unknowns)
+    widen = WIDEN_BESIDE if actuator.effects else WIDEN
     rows = []
     for name, (value, info) in actuator.parameters().items():
         value = float(np.asarray(value))
         if name in layout.names:
             index = layout.index(name)
             slope = layout.slope(name, solution.z)
-            stderr = WIDEN * abs(slope) * float(np.sqrt(max(cov[index, index], 0.0)))
+            stderr = widen * abs(slope) * float(np.sqrt(max(cov[index, index], 0.0)))
             reach = max(abs(value), info.scale)
             at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach)
             start = float(layout.starts[layout.names.index(name)])

@@ -11,6 +11,7 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.verdict import too_little
+from magjax.effects import CATALOGUE
 
 COUNT = 700
 
@@ -118,8 +119,8 @@ def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
 
 
 @pytest.mark.parametrize(
-    ("knots", "after", "rough"), [((26, 18), 6e-8, True), ((26, 18), 1.5e-7, False), ((18, 13), 6e-8, False)],
-    ids=["a rough density", "checks not foretold", "a smooth density"],
+    ("knots", "after", "rough"), [((26, 18), (6e-8,), True), ((26, 18), (1.5e-7,), False), ((26, 18), (6e-8, 3e-7, 3e-7), False), ((18, 13), (6e-8,), False)],
+    ids=["a rough density", "checks not foretold", "one alone foretold", "a smooth density"],
 )  # fmt: skip
 def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(knots, after, rough):
     from fitting.diagnose import _rough
@@ -127,8 +128,22 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
     plain = SimpleNamespace(chi2_per_sample=1.8, data_count=COUNT)
     current = SimpleNamespace(chi2_per_sample=1.4, data_count=COUNT, choices=Choices(knots=knots))
     evidence = SimpleNamespace(reached=Reached(current, [(trial("creep", 1.4), [], [], plain)], {}), plain=plain, candidates=(candidate("creep", 12.0),), excess=1.4)
-    rows = [{"rms_before": 2e-7, "rms_after": after, "noise_rms": 5e-8}]
+    large = (2e-6, 4e-7, 4e-7)[: len(after)] if len(after) > 1 else (2e-7,)
+    rows = [{"rms_before": b, "rms_after": a, "noise_rms": 5e-8} for b, a in zip(large, after, strict=True)]
     assert _rough(evidence, rows) == rough
+
+
+@pytest.mark.parametrize(
+    ("name", "amplitude", "physical"),
+    [("second_eddy_path", 0.3, True), ("second_eddy_path", -0.1, False), ("second_eddy_path", 134.0, False), ("field_diffusion", 57.0, True), ("delta_e", -0.1, True)],
+)  # fmt: skip
+def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
+    """One far beyond what is typical imitates another law; a share that has reached its bound may run on."""
+    from fitting.attribute import _physical
+
+    effect = {c.name: c for c in CATALOGUE}[name]()
+    result = SimpleNamespace(estimate=lambda parameter: SimpleNamespace(value=amplitude))
+    assert _physical(effect, result) == physical
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ BELOW = 0.02  # step has a solution: least share
 class FieldDiffusion(AbstractEffect):
     """Skin effect of a solid cylinder: shells with their own field and relays in place of one loss k dB/dt for all (`chain.shells`)."""
 
-    kappa: Float[Array, ""] = param(0.0, "1", "share of the loss that is distributed as in a solid cylinder", low=0.0, scale=0.3, null=0.0, typical=(0.05, 1.0))
+    kappa: Float[Array, ""] = param(0.0, "1", "share of the loss that is distributed as in a solid cylinder", low=0.0, high=1.0, scale=0.3, null=0.0, typical=(0.05, 1.0))
 
     name = "field_diffusion"
     block = "coil"
