@@ -37,6 +37,7 @@ class Diagnosis:
     message: str
     effects: tuple = ()
     groups: tuple = ()
+    rivals: dict = dataclasses.field(default_factory=dict)
     absorbed: tuple = ()
     unknown: dict | None = None
     data_problem: str | None = None
@@ -64,7 +65,7 @@ class Diagnosis:
         ]  # fmt: skip
         return {
             "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
-            "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
+            "rivals": self.rivals, "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
             "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
             "placebo": self.placebo, "message": self.message, "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
@@ -158,7 +159,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
     if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
-    effects, groups, rivals = _found(evidence)
+    effects, groups, sizes, rivals = _found(evidence)
     if not effects and not groups:
         return _silent(evidence, common, dropped, rough)
     swap = exchange(current, evidence.bench)
@@ -167,27 +168,30 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         groups.append(["sensor_lag", "second_mode"])
     asked = instrument_request({"source", "sensor"} if evidence.command_only else {"sensor"}) if swap else None
     if groups:
-        found = _grouped(evidence, common, effects, groups, rivals, swap, asked)
+        found = _grouped(evidence, common | {"rivals": sizes}, effects, groups, rivals, swap, asked)
     else:
         found = _attributed(evidence, common, effects, swap, asked)
     return dataclasses.replace(found, message=found.message + ROUGH_TEXT) if rough else found
 
 
 def _found(evidence):
-    """Effects that stand alone (rows), groups (names), and the trials of the last group."""
-    effects, groups, last = [], [], []
+    """Effects that stand alone (rows), groups (names), the size that each of their members would have, and the trials of the
+    last group."""
+    effects, groups, sizes, last = [], [], {}, []
     for effect, rivals in evidence.adopted:
         if rivals:
             groups.append([effect.name, *[r.name for r in rivals]])
+            sizes |= {r.name: _record_row(r)["parameters"] for r in (effect, *rivals)}
         else:
             effects.append(_record_row(effect))
     for best, rivals, good, previous in evidence.reached.steps:
         if len(rivals) > 1:
             groups.append([t.name for t in rivals])
+            sizes |= {t.name: _sizes(t.name, evidence.reached.current if t is best else t.result) for t in rivals}
             last = rivals
         else:
             effects.append(_effect_row(best, good, previous, evidence.reached.current))
-    return effects, groups, last
+    return effects, groups, sizes, last
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
@@ -261,15 +265,17 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
 
 def _effect_row(trial, tried, previous, final) -> dict:
     result = final if any(e.name == trial.name for e in final.actuator.effects) else trial.result
-    prefix = f"effects.{trial.name}."
-    parameters = {
-        e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit} for e in result.estimates if e.name.startswith(prefix)
-    }
     shifts = {e.name: [e.value, result.estimate(e.name).value] for e in previous.estimates if e.free and not e.name.startswith("effects.")}
     return {
-        "name": trial.name, "block": trial.candidate.block, "parameters": parameters,
+        "name": trial.name, "block": trial.candidate.block, "parameters": _sizes(trial.name, result),
         "confidence": confidence(trial, tried), "shifts": shifts,
     }  # fmt: skip
+
+
+def _sizes(name, result) -> dict:
+    """The parameters of an effect as a fit has them."""
+    prefix = f"effects.{name}."
+    return {e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit} for e in result.estimates if e.name.startswith(prefix)}
 
 
 def _record_row(effect) -> dict:

@@ -97,11 +97,7 @@ def _named(found, facts):
         return None
     rows, laws = [], []
     for e in found["effects"]:
-        size = "; ".join(
-            f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'] if p['unit'] != '1' else '')}".strip()
-            for n, p in e["parameters"].items()
-        )
-        rows.append([words(e["name"]), e["block"], size, plain(e["confidence"], 2)])
+        rows.append([words(e["name"]), e["block"], _size(e["parameters"]), plain(e["confidence"], 2)])
         about = facts.get(e["name"], {})
         if about.get("law"):
             laws.append(f"{words(e['name'])}: {about['law']}. How it shows: {about['signature']}. Source: {about['source']}.")
@@ -113,6 +109,14 @@ def _named(found, facts):
     )
 
 
+def _size(parameters) -> str:
+    """Parameters with their errors."""
+    return "; ".join(
+        f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'] if p['unit'] != '1' else '')}".strip()
+        for n, p in parameters.items()
+    )
+
+
 def _groups(found, facts):
     if not found["groups"]:
         return None
@@ -120,9 +124,10 @@ def _groups(found, facts):
     for number, group in enumerate(found["groups"], 1):
         for place, name in enumerate(group, 1):
             about = facts.get(name, {})
-            rows.append([words(name), number, place, about.get("block", ""), about.get("signature", "")])
+            size = _size(found.get("rivals", {}).get(name, {}))
+            rows.append([words(name), number, place, about.get("block", ""), size, about.get("signature", "")])
     text = "Each of these would repair the model about as well as the others; to name one from these recordings would be a guess."
-    head = ["rival", "group", "rank in its group", "block", "how it shows"]
+    head = ["rival", "group", "rank in its group", "block", "size, were it this", "how it shows"]
     return section(
         "Not told apart by these recordings", part(text=text, table=tables.table("Rivals, most likely first", head, rows))
     )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fitting.report import rebuild
-from fitting.report.diagnosis_page import headline, interval, placebo_section
+from fitting.report.diagnosis_page import _size, headline, interval, placebo_section
 from fitting.report.fit_page import sentence, validity
 from magjax.errors import ConfigurationError
 
@@ -184,7 +184,7 @@ def test_the_verdict_comes_first_and_in_plain_words(folders, diagnoses):
     assert "sensor" in headline(diagnoses["unknown_at"].as_dict())
 
 
-def test_a_diagnosis_shows_its_grounds(folders):
+def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
     page = (folders["attributed"] / "report.html").read_text(encoding="utf-8")
     heads = [e[2] for e in Outline(page).all("h2")]
     assert (
@@ -202,6 +202,8 @@ def test_a_diagnosis_shows_its_grounds(folders):
     assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
     group = (folders["group"] / "report.html").read_text(encoding="utf-8")
     assert "Next experiment" in group and "the coil current by a shunt" in group and "most likely first" in group
+    (size,) = map(_size, diagnoses["group"].rivals.values())
+    assert size.startswith("tau = ") and size in group  # what a rival would be
 
 
 def test_a_misfit_that_is_no_number_is_never_a_verdict(folders, tmp_path):

@@ -51,6 +51,7 @@ DIAGNOSIS = {
     "message": "two or three plain sentences: where, what, how much better, what to record next",
     "effects": "what is missing, by catalogue name; empty unless something is named",
     "groups": "lists of names: each effect found but not told apart from its rivals, most likely first",
+    "rivals": "for each name in a group: the parameters that it would have, by name as in `effects[].parameters`",
     "absorbed": "names that these recordings could not show: the density absorbs them",
     "unknown": "null, or what is known of a misfit that no effect explains",
     "data_problem": "null, or why the recordings cannot be judged",
