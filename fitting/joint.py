@@ -19,6 +19,8 @@ from .solver import damped_step, jacobian
 WEIGHT_RANGE = (1e-3, 1e9)
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
 STALLED, STALL = 6, 1e-3  # Jacobians, and the share of chi2 that they must take
+AT_END = (4, 2.0, 1e-3)  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
+PROMISED = 1e-2  # share of half chi2 that may still be promised there: a kink, or the coarse Jacobian, keeps it
 CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
 BEND = 0.2  # of the step, over which its curvature is taken
 
@@ -149,7 +151,7 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
     residual = data_residual(problem, z)
     chi2 = float(residual @ residual)
     cost = 0.5 * (chi2 + z @ prior @ z)
-    normal, path = prior, [chi2]
+    normal, path, gains = prior, [chi2], []
     try:
         for taken in range(1, max_jacobians + 1):
             J = data_jacobian(problem, z)
@@ -171,6 +173,7 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
                 if good or float(predicted) < 1e-6 * cost + 1e-3:
                     break
             decrement = float(damped_step(normal, gradient, z, 1e-9, bounded)[1])
+            gains.append(cost - new_cost if good else 0.0)
             if good:
                 z, residual, cost = new, trial, new_cost
             chi2 = float(residual @ residual)
@@ -181,22 +184,23 @@ def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bo
                 break
             if chi2 / count > FAR and len(path) > STALLED and chi2 > (1 - STALL) * path[-STALLED]:
                 break
-            settled = decrement < 0.5 + 1e-4 * cost
+            stalled = len(gains) >= AT_END[0] and sum(gains[-AT_END[0] :]) < max(AT_END[1], AT_END[2] * cost)
+            settled = stalled or decrement < 0.5 + 1e-4 * cost
             if evidence and chi2 / count < FAR:
                 found = evidence_weights(layout, z, normal, weights)
                 moved = np.max(np.abs(np.log(found / weights)))
                 weights = weights * np.clip(found / weights, 1 / 30, 30)
                 prior = prior_matrix(problem, weights)
                 cost = 0.5 * (chi2 + z @ prior @ z)
-                settled = settled and moved < 0.3
+                settled = stalled or settled and moved < 0.3
             elif evidence and settled:
                 # settled far above the noise: as long as the prior, not the physics, holds it there, let go
                 if chi2 < 0.8 * held and weights.max() > 10 * WEIGHT_RANGE[0]:
-                    held, weights, settled = chi2, np.maximum(weights / 30, WEIGHT_RANGE[0]), False
+                    held, weights, settled, gains = chi2, np.maximum(weights / 30, WEIGHT_RANGE[0]), False, []
                     prior = prior_matrix(problem, weights)
                     cost = 0.5 * (chi2 + z @ prior @ z)
             if settled or not good:
-                converged = decrement < 1.0 + 1e-3 * cost
+                converged = decrement < 1.0 + (PROMISED if stalled else 1e-3) * cost
                 if settled or not evidence or decrement < 1.0:
                     break
                 damping = min(damping, 1e2)

@@ -36,7 +36,7 @@ def test_silent_where_nothing_is_missing(bench):
     assert not found.effects and not found.groups and found.repaired is None
     assert max(abs(c.z) for c in found.candidates) < 5.5
     content = found.as_dict()
-    assert {"verdict", "effects", "groups", "absorbed", "unknown", "data_problem", "candidates", "floors", "where", "check",
+    assert {"verdict", "effects", "groups", "rivals", "absorbed", "unknown", "data_problem", "candidates", "floors", "where", "check",
             "next_experiment", "placebo", "message", "base", "repaired"} == set(content)  # fmt: skip
 
 

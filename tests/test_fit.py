@@ -223,3 +223,21 @@ def test_a_bent_step_follows_the_valley(monkeypatch):
     problem.layout.nonnegative = np.array([True, True])
     held = module.bent_step(problem, np.array([1.0, 0.1]), np.array([1.2, 0.0]), r, J, normal, damping)
     assert held[1] == 0.0  # what the step has put at its bound stays there
+
+
+@pytest.mark.parametrize("most", [(4, 2.0, 1e-3), (99, 2.0, 1e-3)], ids=["as it is", "without the rule"])
+def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
+    """A kink whose derivative promises a fall that no step brings: nothing is gained by the rest of the Jacobians."""
+    from fitting import joint
+
+    kinked = lambda z: np.concatenate([10.0 * (z - 1.0), 40.0 + 6.0 * np.abs(z)])  # noqa: E731
+    sloped = lambda z: np.concatenate([10.0 * np.eye(2), 6.0 * np.eye(2)])  # noqa: E731  one side's, on both
+    monkeypatch.setattr(joint, "data_residual", lambda problem, z: kinked(np.asarray(z)))
+    monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: sloped(z))
+    monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(2))
+    monkeypatch.setattr(joint, "bent_step", lambda problem, z, new, *rest: new)
+    monkeypatch.setattr(joint, "evidence_weights", lambda layout, z, normal, weights: weights)
+    monkeypatch.setattr(joint, "AT_END", most)
+    problem = SimpleNamespace(layout=SimpleNamespace(nonnegative=np.zeros(2, bool)), data_count=1000)
+    found = joint.solve(problem, np.asarray([2.0, 0.5]), np.ones(1))
+    assert found.jacobians < 12 if most[0] == 4 else found.jacobians == 30
