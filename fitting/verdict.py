@@ -25,7 +25,7 @@ FULL_SHARE = 0.96
 CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: right effects on smooth densities leave less
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
-UNSEEN_TEXT = " A wrong c0, H_bias or lambda_s in the bench file would not show here either: R_eddy and the density take it up."
+UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 
 
@@ -207,8 +207,9 @@ def _silent(evidence, common, dropped, rough) -> Diagnosis:
         text += ROUGH_TEXT
     if evidence.absorbed:
         text += f" These recordings could not show {', '.join(evidence.absorbed)}: the density absorbs them."
-    if evidence.bench.drive == "current" and evidence.bench.output == "displacement":
-        text += UNSEEN_TEXT
+    held = [n.split(".")[1] for n in UNSEEN if n not in evidence.bench.free]
+    if held and evidence.bench.drive == "current" and evidence.bench.output == "displacement":
+        text += f" A wrong {' or '.join(held)} in the bench file would not show here either: R_eddy and the density take it up."
     return Diagnosis("nothing_missing", text, **common)
 
 
