@@ -26,6 +26,7 @@ from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis
 
 RECORD_Z = 8.0
 ABSORBED_VISIBILITY = 0.004
+LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
@@ -66,7 +67,7 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     cleaned_check = remove_from_checks(check, [e for e, _ in adopted], bench)
     base_now, candidates = _screened_finer(recordings, bench, base_now, choices, held if zero is None else (*held, "sensor.offset"), progress)
     place = where(base_now, candidates, recordings, bench.output)
-    absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY)
+    absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY and abs(c.z) < Z_THRESHOLD)
     reached = search(recordings, bench, base_now, candidates, choices, progress, cleaned_check)
     evidence = Evidence(
         reached, tuple(adopted), base, base_now, tuple(candidates), tuple(recordings), bench, (check, cleaned_check), _floors(base_now), place, absorbed

@@ -34,6 +34,7 @@ def test_silent_where_nothing_is_missing(bench):
     low = placebo(found.base, 1e-3, 1)  # everything scores above nothing
     assert low["false_alarms"] == 1 and sum(low["named"].values()) == 1
     assert not found.effects and not found.groups and found.repaired is None
+    assert {"linear_strain", "mean_field", "reversible_magnetization"} <= set(found.absorbed)
     assert max(abs(c.z) for c in found.candidates) < 5.5
     content = found.as_dict()
     assert {"verdict", "effects", "groups", "rivals", "absorbed", "unknown", "data_problem", "candidates", "floors", "where", "check",
