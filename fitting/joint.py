@@ -19,7 +19,7 @@ from .solver import damped_step, jacobian
 WEIGHT_RANGE = (1e-3, 1e9)
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
 STALLED, STALL = 6, 1e-3  # Jacobians, and the share of chi2 that they must take
-AT_END = (4, 2.0, 1e-3)  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
+AT_END = (4, 1.0, 5e-4)  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
 PROMISED = 1e-2  # share of half chi2 that may still be promised there: a kink, or the coarse Jacobian, keeps it
 CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
 BEND = 0.2  # of the step, over which its curvature is taken
