@@ -77,13 +77,13 @@ def main():
     p.add_argument("--out", type=Path, default=Path("blind-results"))
     p.add_argument("--workers", type=int, default=1)
     p.add_argument("--numbers", type=int, nargs="*", help="only these cases")
-    p.add_argument("--kept", type=Path, help="a file of score --keep: its cases are not run again")
+    p.add_argument("--kept", type=Path, nargs="*", default=[], help="files of score --keep: their cases are not run again")
     p.add_argument("--until", type=float, default=float("inf"), help="start no case after this many seconds")
     options = p.parse_args()
     if json.loads(SEALS.read_text())[options.suite]["sha256"] != seal(options.suite):
         sys.exit(f"the labels of {options.suite} are not the sealed ones of {SEALS.name}: a case was changed after the seal")
     begin = time.time()
-    kept = {json.loads(line)["name"] for line in options.kept.read_text().splitlines()} if options.kept else set()
+    kept = {json.loads(line)["name"] for file in options.kept for line in file.read_text().splitlines()}
     numbers = range(size(options.suite)) if options.numbers is None else options.numbers
     numbers = [k for k in numbers if f"{options.suite}-{k:03d}" not in kept]
 
