@@ -158,7 +158,7 @@ def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, 
     rows = [{"file": "c", "unit": "m", "rms_before": b * 4e-8, "rms_after": a * 4e-8, "noise_rms": 4e-8} for b, a in zip((1.4, 2.0), after, strict=True)]
     monkeypatch.setattr(module, "check_errors", lambda *a: rows)
     monkeypatch.setattr(module, "exchange", lambda *a: None)
-    monkeypatch.setattr(module, "_found", lambda e: ([{"name": "creep", "block": "mechanics"}], [], []))
+    monkeypatch.setattr(module, "_found", lambda e: ([{"name": "creep", "block": "mechanics"}], [], {}, []))
     plain = SimpleNamespace(chi2_per_sample=220.0, data_count=COUNT, actuator=None)
     current = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=None)
     reached = Reached(current, [(trial("creep", chi2n, base=220.0), [], [], plain)], {})
