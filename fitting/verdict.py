@@ -209,7 +209,7 @@ def _silent(evidence, common, dropped, rough) -> Diagnosis:
         text += f" These recordings could not show {', '.join(evidence.absorbed)}: the density absorbs them."
     held = [n.split(".")[1] for n in UNSEEN if n not in evidence.bench.free]
     if held and evidence.bench.drive == "current" and evidence.bench.output == "displacement":
-        text += f" A wrong {' or '.join(held)} in the bench file would not show here either: R_eddy and the density take it up."
+        text += f" A wrong {', '.join(held[:-1])}{' or ' if held[1:] else ''}{held[-1]} in the bench file would not show here either: R_eddy and the density take it up."
     return Diagnosis("nothing_missing", text, **common)
 
 
