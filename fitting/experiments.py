@@ -25,6 +25,7 @@ SURE = 0.9
 PERIODS = 4
 SHUNT = "the coil's current by a shunt beside its command"
 CALIBRATION = "a calibration of the sensor (its reading of a known displacement; a mass added, which moves the rod's resonance alone, tells too)"
+PICK_UP = "a calibration of the pick-up's channel (its reading of a known emf at the drive's frequencies)"
 INSTRUMENTS = ("source", "sensor")
 CHANNELS = {
     frozenset(("coil", "hysteresis")): "the flux density by a pick-up coil round the rod",
@@ -32,17 +33,17 @@ CHANNELS = {
 }
 
 
-def channels_for(blocks) -> list[str]:
+def channels_for(blocks, output: str = "displacement") -> list[str]:
     """What to record, in words, for rivals (or a model) in these blocks: shunt and calibration where an instrument is among them."""
-    blocks = set(blocks)
+    blocks, known = set(blocks), CALIBRATION if output == "displacement" else PICK_UP
     if frozenset(blocks) in CHANNELS:
         return [CHANNELS[frozenset(blocks)]]
     wanted = []
     if len(blocks) > 1:
         wanted += [SHUNT] if "source" in blocks else []
-        wanted += [CALIBRATION] if "sensor" in blocks else []
+        wanted += [known] if "sensor" in blocks else []
     elif blocks == {"sensor"}:
-        wanted = [CALIBRATION]
+        wanted = [known]
     return wanted
 
 
@@ -60,7 +61,7 @@ def next_experiment(trials, spectra, bench, also=()) -> dict | None:
     if len(trials) < 2:
         return None
     trials = trials[:3]
-    wanted = channels_for({*(t.candidate.block for t in trials), *also})
+    wanted = channels_for({*(t.candidate.block for t in trials), *also}, bench.output)
     names = [t.name for t in trials]
     drives = menu(spectra, bench)
     apart = separations(trials, drives, spectra)

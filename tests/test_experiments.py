@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fitting import experiments
-from fitting.experiments import CALIBRATION, SHUNT, channels_for, instrument_request, menu, next_experiment, separations
+from fitting.experiments import CALIBRATION, PICK_UP, SHUNT, channels_for, instrument_request, menu, next_experiment, separations
 from magjax.bench import load_bench
 
 
@@ -26,6 +26,7 @@ SPECTRA = [spectrum(10, 0.8, 0.1), spectrum(200, 0.4, -0.2)]
 def test_instruments_are_asked_for_by_themselves():
     assert channels_for(("source", "coil")) == [SHUNT]
     assert channels_for(("sensor", "mechanics")) == [CALIBRATION]
+    assert channels_for(("sensor", "coil"), "flux_density") == [PICK_UP]  # no rod that moves is on that bench
     assert channels_for(("source", "sensor", "mechanics")) == [SHUNT, CALIBRATION]
     assert channels_for(("mechanics", "magnetostriction")) == []
     assert "pick-up" in channels_for(("coil", "hysteresis"))[0] and "range" in channels_for(("sensor", "magnetostriction"))[0]
