@@ -112,29 +112,38 @@ def normal_equations(fn, y, residual):
 
 
 def bounded_step(A, gradient, y, nonnegative, rounds: int = 25):
-    """argmin of gradient'd + d'A d/2 with y + d >= 0 where asked: block principal pivoting on the free set."""
-    n = y.shape[0]
-    eye = jnp.eye(n)
+    """argmin of gradient'd + d'A d/2 with y + d >= 0 where asked.
+
+    Block principal pivoting on the free set, quick but without a promise; where it has not ended after `rounds`
+    (a nearly singular A) a feasible active set, which falls at every step, goes on to the optimum.
+    """
     scale = 1 / jnp.sqrt(jnp.maximum(jnp.diagonal(A), 1e-300))
     A = A * scale[:, None] * scale[None, :]
     g = gradient * scale
     floor = jnp.where(nonnegative, -y, -jnp.inf) / scale
+    d, ended = _pivoted(A, g, floor, nonnegative & (y <= 0) & (gradient > 0), rounds)
+    return _descended(A, g, floor, d, ended) * scale
 
-    def solve(fixed):
-        held = jnp.where(fixed, floor, 0.0)
-        held = jnp.where(jnp.isfinite(held), held, 0.0)
-        free = ~fixed
-        masked = jnp.where(free[:, None] & free[None, :], A, eye)
-        rhs = jnp.where(free, -(g + A @ held), 0.0)
-        factor = jax.scipy.linalg.cho_factor(masked + 1e-13 * eye, lower=True)
-        d = jnp.where(free, jax.scipy.linalg.cho_solve(factor, rhs), held)
-        multiplier = g + A @ d
-        return d, (free & (d < floor - 1e-12)), (fixed & (multiplier < -1e-12))
+
+def _minimum(A, g, fixed, at):
+    """The minimum over the free unknowns, the `fixed` ones held where `at` says."""
+    n = len(g)
+    held = jnp.where(fixed, at, 0.0)
+    free = ~fixed
+    masked = jnp.where(free[:, None] & free[None, :], A, jnp.eye(n))
+    factor = jax.scipy.linalg.cho_factor(masked + 1e-13 * jnp.eye(n), lower=True)
+    return jnp.where(free, jax.scipy.linalg.cho_solve(factor, jnp.where(free, -(g + A @ held), 0.0)), held)
+
+
+def _pivoted(A, g, floor, fixed, rounds):
+    """Block principal pivoting: (step, whether it is the optimum)."""
+    n = len(g)
+    floor = jnp.where(jnp.isfinite(floor), floor, -1e300)
 
     def pivot(carry):
         fixed, _, best, count, k = carry
-        d, below, wrong = solve(fixed)
-        bad = below | wrong
+        d = _minimum(A, g, fixed, floor)
+        bad = (~fixed & (d < floor - 1e-12)) | (fixed & (g + A @ d < -1e-12))
         number = jnp.sum(bad)
         # Murty's single exchange once the block exchange stops making progress
         worst = jnp.arange(n) == (n - 1 - jnp.argmax(bad[::-1]))
@@ -142,10 +151,39 @@ def bounded_step(A, gradient, y, nonnegative, rounds: int = 25):
         change = jnp.where(stuck, bad & worst, bad)
         return fixed ^ change, d, jnp.minimum(best, number), jnp.where(number < best, 0, count + 1), k + 1
 
-    def unfinished(carry):
-        return (carry[2] > 0) & (carry[4] < rounds)
-
-    fixed = nonnegative & (y <= 0) & (gradient > 0)
     start = (fixed, jnp.zeros(n), jnp.asarray(n + 1), jnp.asarray(0), jnp.asarray(0))
-    _, d, *_ = jax.lax.while_loop(unfinished, pivot, start)
-    return jnp.maximum(d, floor) * scale
+    _, d, left, *_ = jax.lax.while_loop(lambda c: (c[2] > 0) & (c[4] < rounds), pivot, start)
+    return jnp.maximum(d, floor), left == 0
+
+
+def _descended(A, g, floor, d, ended, most: int = 400):
+    """The feasible active set from `d`, or from 0 where that is lower: unknowns that a step drives below their floor are fixed
+    there (all of them where that falls further than to the first of them), and freed again at the minimum of the rest."""
+    tolerance = 1e-11 * jnp.max(jnp.abs(g))
+
+    def height(x):
+        return g @ x + 0.5 * x @ A @ x
+
+    def onward(carry):
+        d, fixed, low, _, k = carry
+        x = _minimum(A, g, fixed, d)
+        below = ~fixed & (x < floor)
+        reach = jnp.where(below, (floor - d) / jnp.where(below, x - d, -1.0), jnp.inf)
+        part = jnp.clip(jnp.min(reach), 0.0, 1.0)
+        first = below & (reach <= part)
+        whole, partly = jnp.maximum(x, floor), jnp.where(first, floor, jnp.maximum(d + part * (x - d), floor))
+        farther = height(whole) < height(partly)
+        blocked = jnp.any(below)
+        # at a minimum of the free: let go of those that pull inward, of one alone where nothing was gained since the last
+        slope = g + A @ x
+        pull = fixed & (slope < -tolerance)
+        gained = height(x) < low - 1e-13 * jnp.abs(low)
+        released = pull & (gained | (slope <= jnp.min(jnp.where(pull, slope, jnp.inf))))
+        d = jnp.where(blocked, jnp.where(farther, whole, partly), x)
+        fixed = jnp.where(blocked, fixed | jnp.where(farther, below, first), fixed & ~released)
+        return d, fixed, jnp.where(blocked, low, height(x)), ~blocked & ~jnp.any(pull), k + 1
+
+    start = jnp.where(ended | (height(d) < 0), d, 0.0)
+    fixed = (start <= floor) & (g + A @ start > 0)
+    d, *_ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < most), onward, (start, fixed, jnp.asarray(jnp.inf), ended, jnp.asarray(0)))
+    return d
