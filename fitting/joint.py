@@ -5,16 +5,18 @@ Harmonics in, the steps of the projected Levenberg-Marquardt solver, roughness w
 """
 
 import dataclasses
+import functools
 import time
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import structural_rank
 
 from .model import Layout, Predictor, Target, whitened
-from .solver import damped_step, jacobian
+from .solver import damped_step, pushed
 
 WEIGHT_RANGE = (1e-3, 1e9)
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
@@ -47,6 +49,15 @@ class Problem:
         finite = np.isfinite(np.asarray(self.target.deviations))
         return int(2 * finite.sum() - finite[:, 0].sum())
 
+    @functools.cached_property
+    def marching(self) -> tuple:
+        """The part of the problem up to the magnetization: layout and template without the effects behind it, and where its
+        unknowns stand in z. All fits that differ in those effects alone share its compiled program, the larger part by far."""
+        template = self.template
+        behind = {e.name for e in template.effects if not e.marches}
+        layout, place = self.layout.without({n for n in self.layout.names if n.startswith("effects.") and n.split(".")[1] in behind})
+        return layout, dataclasses.replace(template, effects=tuple(e for e in template.effects if e.marches)), place
+
     def with_weights(self, weights) -> "Problem":
         """The same problem with other roughness weights."""
         target = eqx.tree_at(lambda t: t.weights, self.target, jnp.asarray(weights, dtype=float))
@@ -70,23 +81,46 @@ class Solution:
 
 
 @eqx.filter_jit
-def _data_residual(layout, z, target, template, predictors):
-    return whitened(predictors[1](layout.actuator(template, z), layout.levels(z)), target)
+def _march(layout, z, template, predictor):
+    return predictor.march(layout.actuator(template, z), layout.levels(z))
 
 
 @eqx.filter_jit
-def _data_jacobian(layout, z, target, template, predictors):
-    return jacobian(lambda y: whitened(predictors[0](layout.actuator(template, y), layout.levels(y)), target), z)
+def _march_tangents(layout, z, template, predictor):
+    """Fields and magnetizations, and their change with each unknown, (unknowns, recordings, samples) per grid."""
+    marched, push = jax.linearize(lambda y: predictor.march(layout.actuator(template, y), layout.levels(y)), z)
+    return marched, pushed(push, jnp.eye(z.shape[0]))
+
+
+@eqx.filter_jit
+def _read_residual(layout, z, target, template, predictor, marched):
+    return whitened(predictor.lines(layout.actuator(template, z), marched), target)
+
+
+@eqx.filter_jit
+def _read_jacobian(layout, z, target, template, predictor, marched, tangents, place):
+    """The Jacobian from the tangents of the march, those of unknowns `place`; the others do not move it."""
+    n = z.shape[0]
+    _, push = jax.linearize(lambda y, fields: whitened(predictor.lines(layout.actuator(template, y), fields), target), z, marched)
+    tangents = jax.tree.map(lambda t: jnp.zeros((n, *t.shape[1:])).at[place].set(t), tangents)
+    return pushed(lambda given: push(*given), (jnp.eye(n), tangents)).T
 
 
 def data_residual(problem: Problem, z):
     """Whitened misfit of the harmonics on the fine grid."""
-    return np.asarray(_data_residual(problem.layout, jnp.asarray(z), problem.target, problem.template, problem.predictors))
+    z, predictor = np.asarray(z, float), problem.predictors[1]
+    layout, template, place = problem.marching
+    marched = _march(layout, jnp.asarray(z[place]), template, predictor)
+    return np.asarray(_read_residual(problem.layout, jnp.asarray(z), problem.target, problem.template, predictor, marched))
 
 
 def data_jacobian(problem: Problem, z):
     """Its Jacobian, (data, unknowns), on the coarse grid."""
-    return np.asarray(_data_jacobian(problem.layout, jnp.asarray(z), problem.target, problem.template, problem.predictors))
+    z, predictor = np.asarray(z, float), problem.predictors[0]
+    layout, template, place = problem.marching
+    marched, tangents = _march_tangents(layout, jnp.asarray(z[place]), template, predictor)
+    arguments = (problem.layout, jnp.asarray(z), problem.target, problem.template, predictor, marched, tangents, jnp.asarray(place))
+    return np.asarray(_read_jacobian(*arguments))
 
 
 def evidence_weights(layout: Layout, z, normal, weights):

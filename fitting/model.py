@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from magjax.chain import Timeline
 from magjax.preisach import Preisach
-from magjax.simulate import run_chain
+from magjax.simulate import driven_current, finish_chain, march_chain
 
 from .density import DensityBasis
 
@@ -84,6 +85,17 @@ class Layout(eqx.Module):
             return float(np.log(value / self.starts[k]))
         return float((value - self.starts[k]) / self.scales[k])
 
+    def without(self, dropped) -> tuple["Layout", np.ndarray]:
+        """The layout without some of the parameters, and where its unknowns stand in this one."""
+        kept = [k for k, name in enumerate(self.names) if name not in dropped]
+        n = self.density_unknowns + 1
+        place = np.concatenate([np.arange(n), n + np.asarray(kept, int), np.arange(n + len(self.names), self.size)])
+        if len(kept) == len(self.names):
+            return self, place
+        starts, scales = (jnp.asarray(np.asarray(x)[kept]) for x in (self.starts, self.scales))
+        names, log = (tuple(x[k] for k in kept) for x in (self.names, self.log))
+        return dataclasses.replace(self, starts=starts, scales=scales, names=names, log=log), place
+
     def levels(self, z):
         """What each recording's start transient adds to M, A/m, (recordings,) or None."""
         return MEMORY * self.total * z[self.size - self.memories :] if self.memories else None
@@ -149,11 +161,15 @@ class Predictor(eqx.Module):
 
         `levels`: what is added to M in each recording, A/m, (recordings,).
         """
+        return self.lines(actuator, self.march(actuator, levels))
+
+    def march(self, actuator, levels=None):
+        """Field and magnetization of every recording, A/m: per grid a pair of (recordings, samples)."""
 
         def one(drive, dt, level):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
-            signals = run_chain(shifted, drive, dt, self.periods, self.corners)
-            return jnp.fft.rfft(signals.reading)[: self.harmonics + 1] / drive.shape[0]
+            line = Timeline(dt, drive.shape[0], True)
+            return march_chain(shifted, line, driven_current(actuator, drive, line), self.periods, self.corners)[:2]
 
         order = np.asarray(self.index)
         levels = jnp.zeros(len(order)) if levels is None else levels
@@ -162,7 +178,19 @@ class Predictor(eqx.Module):
         for drive, dt in zip(self.drives, self.steps, strict=True):
             parts.append(jax.vmap(one)(drive, dt, levels[at : at + drive.shape[0]]))
             at += drive.shape[0]
-        return jnp.concatenate(parts)[order]
+        return tuple(parts)
+
+    def lines(self, actuator, marched):
+        """The reading's coefficients from what `march` gave: the blocks behind the hysteresis."""
+
+        def one(drive, dt, H, M):
+            line = Timeline(dt, drive.shape[0], True)
+            zero = jnp.zeros(())
+            signals = finish_chain(actuator, line, drive, driven_current(actuator, drive, line), H, M, H, zero, zero)
+            return jnp.fft.rfft(signals.reading)[: self.harmonics + 1] / drive.shape[0]
+
+        parts = [jax.vmap(one)(d, t, *fields) for d, t, fields in zip(self.drives, self.steps, marched, strict=True)]
+        return jnp.concatenate(parts)[np.asarray(self.index)]
 
 
 @eqx.filter_jit

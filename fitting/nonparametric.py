@@ -17,10 +17,10 @@ from magjax.chain import Timeline
 from magjax.constants import MU0
 from magjax.effects.base import AbstractEffect
 from magjax.effects.learned_term import PAD, LearnedTerm
-from magjax.simulate import finish_chain, run_chain
+from magjax.simulate import driven_current, finish_chain, run_chain
 
 from .model import whitened
-from .screen import Projector, _march_columns, _trajectory, changed_drive
+from .screen import Projector, _march_columns, _trajectory
 
 ONE = 48  # cosines of a function of one variable
 FINE = 160  # where none of these serves: of one variable of the sensor or the strain
@@ -133,7 +133,7 @@ def _late_columns(predictor, actuator, states, directions):
         def one(drive, dt, H, M, parts):
             line = Timeline(dt, drive.shape[0], True)
             changed = dataclasses.replace(actuator, effects=(*actuator.effects, _VirtualSignal(*parts)))
-            s = finish_chain(changed, line, drive, changed_drive(actuator, drive, line), H, M, H, H, jnp.zeros(()))
+            s = finish_chain(changed, line, drive, driven_current(actuator, drive, line), H, M, H, H, jnp.zeros(()))
             return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / drive.shape[0]
 
         grids = zip(predictor.drives, predictor.steps, states, signals, strict=True)

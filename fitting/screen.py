@@ -17,7 +17,7 @@ import numpy as np
 from magjax.chain import Timeline
 from magjax.chain.coupled import disturbance_of, magnetize
 from magjax.effects import CATALOGUE
-from magjax.simulate import finish_chain
+from magjax.simulate import driven_current, finish_chain
 
 from .joint import data_jacobian, data_residual
 from .model import predicted_lines, whitened
@@ -120,7 +120,7 @@ def _late_columns(predictor, actuator, states, effects):
         def one(drive, dt, H, M):
             line = Timeline(dt, drive.shape[0], True)
             zero = jnp.zeros(())
-            s = finish_chain(changed, line, drive, changed_drive(actuator, drive, line), H, M, H, H, zero)
+            s = finish_chain(changed, line, drive, driven_current(actuator, drive, line), H, M, H, H, zero)
             return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / drive.shape[0]
 
         parts = [jax.vmap(one)(d, t, H, M) for d, t, (H, M) in zip(predictor.drives, predictor.steps, states, strict=True)]
@@ -132,21 +132,13 @@ def _late_columns(predictor, actuator, states, effects):
     return [jax.vmap(column)(e) for e in effects]
 
 
-def changed_drive(actuator, drive, line):
-    """The coil current behind the source and its effects."""
-    current = actuator.source(drive)
-    for effect in actuator.effects:
-        current = effect.drive(current, line, actuator)
-    return current
-
-
 @eqx.filter_jit
 def _trajectory(predictor, actuator):
     """Relay field, magnetization, coil current and step of the whole march of every recording, grid by grid."""
 
     def one(drive, dt):
         line = Timeline(dt, drive.shape[0], True)
-        current = changed_drive(actuator, drive, line)
+        current = driven_current(actuator, drive, line)
         _, M, v, current = _march(predictor, actuator, current, dt)[:4]
         return v, M, current, dt
 
@@ -186,7 +178,7 @@ def _march_columns(predictor, actuator, directions):
         def one(drive, dt, given, change):
             count = drive.shape[0]
             line = Timeline(dt, count, True)
-            current = changed_drive(actuator, drive, line) + change
+            current = driven_current(actuator, drive, line) + change
             H, M, v, _, res, over = _march(predictor, actuator, current, dt, given)
             M = M + actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
             H, M, v, res = (x[-count - 1 : -1] for x in (H, M, v, res))

@@ -95,14 +95,20 @@ def damped_step(normal, gradient, y, damping, nonnegative):
     return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
 
 
-def jacobian(fn, y, chunk: int = CHUNK):
+def jacobian(fn, y):
     """The dense Jacobian of fn at y, (residuals, unknowns), in chunks of columns."""
-    _, push = jax.linearize(fn, y)
-    n = y.shape[0]
+    return pushed(jax.linearize(fn, y)[1], jnp.eye(y.shape[0])).T
+
+
+def pushed(push, directions, chunk: int = CHUNK):
+    """A linear function of each of the directions (a tree of (columns, ...)), in chunks of columns: (columns, ...)."""
+    n = jax.tree.leaves(directions)[0].shape[0]
     chunks = -(-n // chunk)
     chunk = -(-n // chunks)  # all of one size: a smaller rest would be compiled once more
-    rows = jax.lax.map(jax.vmap(push), jnp.eye(chunks * chunk, n).reshape(chunks, chunk, n))
-    return rows.reshape(chunks * chunk, -1)[:n].T
+    rest = chunks * chunk - n
+    parts = jax.tree.map(lambda d: jnp.concatenate([d, jnp.zeros((rest, *d.shape[1:]))]).reshape(chunks, chunk, *d.shape[1:]), directions)
+    rows = jax.lax.map(jax.vmap(push), parts)
+    return jax.tree.map(lambda r: r.reshape(chunks * chunk, *r.shape[2:])[:n], rows)
 
 
 def normal_equations(fn, y, residual):

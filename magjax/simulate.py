@@ -46,17 +46,27 @@ def require_x64():
 def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str | None = None) -> Signals:
     """The chain as a pure function for `jit`, `vmap` and derivatives. `periods` = 0: not periodic; else run so many
     and return the last. `scheme`: of the coupled step, the coil's own if None."""
-    scheme = scheme or actuator.coil.scheme
-    count = command.shape[0]
-    periodic = periods > 0
-    line = Timeline(jnp.asarray(dt, dtype=float), count, periodic)
+    line = Timeline(jnp.asarray(dt, dtype=float), command.shape[0], periods > 0)
+    current = driven_current(actuator, command, line)
+    return finish_chain(actuator, line, command, current, *march_chain(actuator, line, current, periods, corners, scheme))
+
+
+def driven_current(actuator, command, line):
+    """The current in the coil, A (the applied field, A/m, on a field-driven bench): the source and its effects, (time,)."""
     current = actuator.source(command)
     for effect in actuator.effects:
         current = effect.drive(current, line, actuator)
+    return current
+
+
+def march_chain(actuator, line, current, periods: int, corners: int, scheme: str | None = None):
+    """Coil and hysteresis: field H, magnetization M, relay field, residual (all (time,), A/m) and overflow; see `run_chain`."""
+    scheme = scheme or actuator.coil.scheme
+    count = current.shape[0]
     applied = actuator.coil.applied_field(current)
     table = actuator.hysteresis.table()
     memory = actuator.hysteresis.memory(table, corners)
-    if periodic:
+    if periods > 0:
         whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (applied, current)]
         parts = magnetize(actuator, *whole, line.dt, memory, scheme, period=count)
         M_unreached = actuator.hysteresis.unreached(jnp.max(parts[2][-count:]), jnp.min(parts[2][-count:]))
@@ -65,7 +75,7 @@ def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str | N
     else:
         parts = magnetize(actuator, applied, current, line.dt, memory, scheme)
         H, M, v, residual = parts[:4]
-    return finish_chain(actuator, line, command, current, H, M, v, residual, parts[4])
+    return H, M, v, residual, parts[4]
 
 
 def finish_chain(actuator, line, command, current, H, M, v, residual, overflow) -> Signals:

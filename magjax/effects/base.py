@@ -64,6 +64,11 @@ class AbstractEffect(eqx.Module):
         """Declared parameters: name -> ParameterInfo."""
         return parameters_of(cls)
 
+    @property
+    def marches(self) -> bool:
+        """Whether it changes the field or the magnetization: all that stand before the magnetostriction do."""
+        return self.in_step or self.shells > 0 or self.block == "source"
+
     @classmethod
     def finite_trials(cls, drives, steps):
         """For a source effect without a derivative at null: parameters at which the screening tries it, else None.
