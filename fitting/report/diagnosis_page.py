@@ -30,11 +30,12 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     output = (fit.get("recordings") or [{"channel": "displacement"}])[0]["channel"]
     broken = bool(fit) and not math.isfinite(fit["chi2_per_sample"] if fit["chi2_per_sample"] is not None else math.nan)
     drive = str(evidence.get("drive", "current"))
+    names = {c["name"] for c in found["candidates"]} | set(facts)
     sections = [
         _named(found, facts),
         _groups(found, facts),
         _unknown(found, sketch),
-        section("Next experiment", *_next(found)),
+        section("Next experiment", *_next(found, names)),
         section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"))),
         _checks(found, evidence, sketch, output, drive),
         _where(found, facts, base, sketch, output),
@@ -53,9 +54,6 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         if fit
         else "No model could be fitted."
     )
-    message = found["message"]
-    for name in sorted({c["name"] for c in found["candidates"]} | set(facts), key=len, reverse=True):
-        message = message.replace(name, words(name))
     said = (
         "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file."
         if broken
@@ -64,13 +62,20 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     return {
         "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else TONES.get(found["verdict"], "bad"),
         "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
-        "message": [said or sentence(message)], "sections": [s for s in sections if s],
+        "message": [said or sentence(spoken(found["message"], names))], "sections": [s for s in sections if s],
     }  # fmt: skip
 
 
 def words(name: str) -> str:
     """An effect's name as people say it."""
     return name.replace("_", " ")
+
+
+def spoken(text: str, names) -> str:
+    """A text with the effects' `names` as people say them."""
+    for name in sorted(names, key=len, reverse=True):
+        text = text.replace(name, words(name))
+    return text
 
 
 def headline(found) -> str:
@@ -150,11 +155,11 @@ def _unknown(found, sketch):
     return section("What is known of it", known, *learned.parts(unknown, sketch))
 
 
-def _next(found):
+def _next(found, names):
     ask = found["next_experiment"]
     if not ask:
         return []
-    parts = [part(text=sentence(ask["text"]))]
+    parts = [part(text=sentence(spoken(ask["text"], names)))]
     channels = [c for c in ask.get("channels", []) if c]
     parts.append(part(text=f"Channels to record: {'; '.join(channels)}.") if channels else None)
     rows = [[words(a), words(b), plain(p, 2)] for a, b, p in ask.get("separates", [])]

@@ -80,7 +80,7 @@ def diagnoses(runs, bench, fitted, poor):
         "shifts": {"coil.R_eddy": [80.0, 62.0], "mechanics.xi": [0.9, 0.81]},
     }  # fmt: skip
     ask = {
-        "text": "four settled periods of 0.8 A at 500 Hz",
+        "text": f"four settled periods of 0.8 A at 500 Hz: separates {names[0]} from {names[1]}",
         "drive": {},
         "channels": ["the coil current by a shunt"],
         "separates": [[*names, 0.97]],

@@ -202,6 +202,8 @@ def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
     assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
     group = (folders["group"] / "report.html").read_text(encoding="utf-8")
     assert "Next experiment" in group and "the coil current by a shunt" in group and "most likely first" in group
+    apart = " from ".join(n.replace("_", " ") for n in diagnoses["group"].groups[0])
+    assert f"separates {apart}" in group  # no underscores in what people read
     (size,) = map(_size, diagnoses["group"].rivals.values())
     assert size.startswith("tau = ") and size in group  # what a rival would be
 
