@@ -11,8 +11,8 @@ import numpy as np
 from magjax.bench import load_bench
 
 from .alternation import alternating
-from .attribute import chi2_of
-from .fit import REFINE_BELOW
+from .attribute import MIN_DROP, TIE, WEAK_TIE, chi2_of
+from .fit import FINER_FROM, REFINE_BELOW
 from .fit import fit_or_stop as fit
 from .floors import data_problem, record_effects, remove_from_checks, remove_record_effect, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
@@ -25,6 +25,7 @@ from .setup import Choices, effect_parameters, spectra_of
 from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
 
 RECORD_Z = 8.0
+FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 ABSORBED_VISIBILITY = 0.004
 LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
@@ -58,14 +59,14 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     base_now = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
     if problem := wrong_bench(base_now):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base_now)
-    base_now, zero = _sensor_zero(cleaned, bench, base_now, actuator, held, choices, progress)
-    base = base_now
+    candidates = screened(base_now, choices)
+    base_now, candidates, zero, rival = _sensor_zero(cleaned, bench, base_now, candidates, actuator, held, choices, progress)
+    base, held = base_now, held if zero is None else (*held, "sensor.offset")
     if adopted:  # what the plain model makes of the readings as they came
-        free = held if zero is None else (*held, "sensor.offset")
-        base = fit(recordings, bench, actuator=actuator, extra=free, choices=base_now.choices, progress=progress, refine=False)
+        base = fit(recordings, bench, actuator=actuator, extra=held, choices=base_now.choices, progress=progress, refine=False)
     recordings = cleaned
     cleaned_check = remove_from_checks(check, [e for e, _ in adopted], bench)
-    base_now, candidates = _screened_finer(recordings, bench, base_now, choices, held if zero is None else (*held, "sensor.offset"), progress)
+    base_now, candidates = _screened_finer(recordings, bench, base_now, candidates, choices, held, progress)
     place = where(base_now, candidates, recordings, bench.output)
     absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY and abs(c.z) < Z_THRESHOLD)
     reached = search(recordings, bench, base_now, candidates, choices, progress, cleaned_check)
@@ -80,27 +81,45 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
             found = with_learned_term(found, base_now, recordings, bench, cleaned_check, progress)
     if placebo_runs > 0:
         found = dataclasses.replace(found, placebo=placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress))
-    if zero is None:
+    if zero is not None:
+        note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
+    elif rival is not None and (found.effects or found.groups):
+        note = f" A sensor's zero {rival:.3g} m away from the rod's rest would explain as much; if it was not set there, free sensor.offset in the bench file."
+    else:
         return found
-    note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
     return dataclasses.replace(found, message=found.message + note)
 
 
-def _sensor_zero(recordings, bench, base, actuator, held, choices, progress):
-    """A sensor whose zero is not the rod's rest: adopted as part of the base only if that alone meets the noise."""
-    if bench.output != "displacement" or base.chi2_per_sample < 3 or "sensor.offset" in bench.free:
-        return base, None
-    if offset_score(base.problem, base.refined) ** 2 < 0.5 * (chi2_of(base) - base.data_count):  # it cannot explain the misfit
-        return base, None
-    freed = fit(recordings, bench, actuator=actuator, extra=(*held, "sensor.offset"), choices=choices, progress=progress)
+def _sensor_zero(recordings, bench, base, candidates, actuator, held, choices, progress):
+    """A sensor whose zero is not the rod's rest: part of the base, if it scores above any effect and alone meets the noise.
+
+    Returns the base, its candidates, the zero, m, or None, and the zero that would explain as much as the best effect, or None.
+    """
+    as_it_is = base, candidates, None, None
+    if bench.output != "displacement" or "sensor.offset" in bench.free:
+        return as_it_is
+    best, excess = max((c.z**2 for c in candidates), default=0.0), chi2_of(base) - 0.92 * base.data_count
+    score = offset_score(base.problem, base.refined) ** 2
+    tied = max(TIE, WEAK_TIE[0] * best)
+    needed = min(best - tied, 0.5 * excess) if base.chi2_per_sample > FAR_ZERO else best - tied
+    if score < max(Z_THRESHOLD**2, needed):
+        return as_it_is
+    asked = {"actuator": actuator, "extra": (*held, "sensor.offset"), "progress": progress, "spectra": base.spectra}
+    freed = fit(recordings, bench, choices=base.choices, start=base, refine=False, **asked)
+    if chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
+        return as_it_is
+    if freed.chi2_per_sample > FINER_FROM[0]:  # the density was chosen under the misfit
+        freed = fit(recordings, bench, choices=choices, **asked)
     if freed.chi2_per_sample > SILENT_CHI2:
-        return base, None
-    return freed, freed.estimate("sensor.offset").value
+        return as_it_is
+    zero = freed.estimate("sensor.offset").value
+    if score < best + tied and base.chi2_per_sample < FAR_ZERO:
+        return base, candidates, None, zero
+    return freed, screened(freed, choices), zero, None
 
 
-def _screened_finer(recordings, bench, base, choices, held, progress):
+def _screened_finer(recordings, bench, base, candidates, choices, held, progress):
     """The base and its candidates; where none would take half of what is left, a finer density is given a chance first."""
-    candidates = screened(base, choices)
     best = max((c.z**2 for c in candidates), default=0.0)
     meant = REFINE_BELOW <= base.chi2_per_sample < UNEXPLAINED and base.choices.knots is not None
     if not meant or best > 0.5 * (chi2_of(base) - base.data_count):

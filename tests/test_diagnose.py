@@ -1,8 +1,12 @@
 """The diagnosis on concealed benches: silence on a null, the right name, the data's own problems."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+import fitting.diagnose as module
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
@@ -148,3 +152,22 @@ def test_periods_that_do_not_repeat_are_a_data_problem():
             recordings.append(Recording(t, {"current": 0.5 * wave, "displacement": y}, {}, {}, f"{f} Hz"))
         found = data_problem(recordings, spectra_of(recordings, bench), "displacement")
         assert (found is not None and "do not repeat" in found) == wrong
+
+
+def test_a_sensors_zero_is_adopted_where_it_scores_best_and_told_of_where_an_effect_does_as_well(bench, monkeypatch):
+    rng = np.random.default_rng(3)
+    truth, zero = concealed_actuator(bench), 6e-6
+    runs = [record(truth, *drive, rng, f"r{drive[0]}") for drive in ((10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0))]
+    runs = [dataclasses.replace(r, channels={**r.channels, "displacement": r.channels["displacement"] + zero}) for r in runs]
+    base = module.fit(runs, bench, refine=False)
+    monkeypatch.setattr(module, "screened", lambda result, choices: [])
+    asked = (None, (), base.choices, None)
+    score = abs(module.offset_score(base.problem, base.refined))
+    assert score > 8
+    rival = SimpleNamespace(z=1.02 * score)
+    same, candidates, none, told = module._sensor_zero(runs, bench, base, [rival], *asked)
+    assert same is base and candidates == [rival] and none is None and told == pytest.approx(zero, abs=1.2e-6)
+    freed, _, found, none = module._sensor_zero(runs, bench, base, [SimpleNamespace(z=0.5 * score)], *asked)
+    assert found == pytest.approx(zero, abs=1.2e-6) and none is None and freed.chi2_per_sample < base.chi2_per_sample
+    better = module._sensor_zero(runs, bench, base, [SimpleNamespace(z=2 * score)], *asked)
+    assert better[0] is base and better[2:] == (None, None)
