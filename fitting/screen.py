@@ -98,14 +98,7 @@ def applicable(actuator, quasistatic: bool = False):
 @eqx.filter_jit
 def _steady_state(predictor, actuator):
     """Field and magnetization over the last period of every recording, grid by grid."""
-
-    def one(drive, dt):
-        from magjax.simulate import run_chain
-
-        s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners)
-        return s.field, s.magnetization
-
-    return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
+    return predictor.march(actuator)
 
 
 @eqx.filter_jit
@@ -115,16 +108,7 @@ def _late_columns(predictor, actuator, states, effects):
     `effects`: of each kind one, its shapes stacked."""
 
     def lines_of(effect, amplitude):
-        changed = dataclasses.replace(actuator, effects=(*actuator.effects, effect.with_amplitude(amplitude)))
-
-        def one(drive, dt, H, M):
-            line = Timeline(dt, drive.shape[0], True)
-            zero = jnp.zeros(())
-            s = finish_chain(changed, line, drive, driven_current(actuator, drive, line), H, M, H, H, zero)
-            return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / drive.shape[0]
-
-        parts = [jax.vmap(one)(d, t, H, M) for d, t, (H, M) in zip(predictor.drives, predictor.steps, states, strict=True)]
-        return jnp.concatenate(parts)[np.asarray(predictor.index)]
+        return predictor.lines(dataclasses.replace(actuator, effects=(*actuator.effects, effect.with_amplitude(amplitude))), states)
 
     def column(effect):
         return jax.jvp(lambda a: lines_of(effect, a), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
