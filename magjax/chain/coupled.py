@@ -5,17 +5,17 @@ With k the loss of the coil, X = H + M and a = mu0 k / h, one step of the second
 and of the trapezoid rule
     a (X1 - X0) + (H1 + H0)/2 = (applied 0 + applied 1)/2,                      p = 1/2 + a,   q = a.
 Both ask for p v + q M(v) = rhs: strictly monotone and piecewise quadratic in the field v. Corners that the step wipes
-out follow from stored values, the cell by a search over the levels, the rest from a quadratic in closed form; one
-Newton polish with a frozen slope adds nothing to the value and makes every derivative exact.
+out follow from stored values, the cell by a search over the levels, the rest from a quadratic in closed form; where a
+derivative is asked for, one Newton polish with a frozen slope, which adds nothing to the value, makes it exact.
 The backward formula does not ring where the time constant mu0 k (1 + dM/dH) is far below the step, as at low frequency,
 and turns into M(applied field) for k = 0; the trapezoid has the smaller error constant where the loop is resolved.
 """
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.lax import stop_gradient
 
 from ..constants import MU0
@@ -40,15 +40,42 @@ class _Carry(eqx.Module):
     marks: tuple  # states of effects at the last end of a period
 
 
-def solve_branch(table, memory: Memory, p, q, rhs):
-    """The field v with p v + q M(v) = rhs: (v, M(v), rising, kept); the derivatives of v and M are exact."""
-    frozen_table, frozen, pf, qf, rf = stop_gradient((table, memory, p, q, rhs))
-    rising = rf >= pf * frozen.field + qf * frozen.magnetization
-    up = jnp.sum(pf * frozen.maxima + qf * frozen.m_maxima > rf)
-    down = jnp.sum(pf * frozen.minima + qf * frozen.m_minima < rf)
+def solve_frozen(table, memory: Memory, p, q, rhs):
+    """The field v with p v + q M(v) = rhs, without a derivative: (v, M(v), rising, kept)."""
+    table, memory, p, q, rhs = stop_gradient((table, memory, p, q, rhs))
+    rising = rhs >= p * memory.field + q * memory.magnetization
+    up = jnp.sum(p * memory.maxima + q * memory.m_maxima > rhs)
+    down = jnp.sum(p * memory.minima + q * memory.m_minima < rhs)
     kept = jnp.where(rising, up, down)
-    v = _locate(frozen_table, frozen.select(frozen_table, rising, kept), pf, qf, rf)
-    return (*polish(table, memory, rising, kept, v, p, q, rhs), rising, kept)
+    v, m = _locate(table, memory.select(table, rising, kept), p, q, rhs)
+    return v, m, rising, kept
+
+
+@jax.custom_jvp
+def solve_branch(table, memory: Memory, p, q, rhs):
+    """As `solve_frozen`, with exact derivatives of v and M. The polish that makes them is done where one is asked for."""
+    return solve_frozen(table, memory, p, q, rhs)
+
+
+def _polished(given, tangents):
+    v, m, rising, kept = solve_frozen(*given)
+    leaves, tree = jax.tree.flatten(given)
+    directions = tree.flatten_up_to(tangents)
+    moving = [k for k, d in enumerate(directions) if type(d) is not SymbolicZero]
+
+    def there(*moved):
+        at = list(leaves)
+        for k, leaf in zip(moving, moved, strict=True):
+            at[k] = leaf
+        table, memory, p, q, rhs = jax.tree.unflatten(tree, at)
+        return polish(table, memory, rising, kept, v, p, q, rhs)
+
+    (v, m), (dv, dm) = jax.jvp(there, [leaves[k] for k in moving], [directions[k] for k in moving])
+    none = [np.zeros(x.shape, jax.dtypes.float0) for x in (rising, kept)]
+    return (v, m, rising, kept), (dv, dm, *none)
+
+
+solve_branch.defjvp(_polished, symbolic_zeros=True)
 
 
 def polish(table, memory, rising, kept, v, p, q, rhs, extra=0.0, extra_slope=0.0):
@@ -83,7 +110,7 @@ def _slope(table, field, threshold, rising):
 
 
 def _locate(table, branch, p, q, rhs):
-    """The solution itself, all inputs frozen: a search over the levels, then the quadratic of one cell."""
+    """The solution and M there, all inputs frozen: a search over the levels, then the quadratic of one cell."""
     rising, _, threshold, m_there = branch
     L, width = table.cells, table.cells + 1
     fixed, share = table.locate(threshold)
@@ -94,19 +121,18 @@ def _locate(table, branch, p, q, rhs):
     constant = p * table.low + q * (m_there - 2 * sign * share * (1 - share) * take(table.diagonal, fixed)) - rhs
 
     def not_above(level):
-        at = base + jnp.clip(level, 0, L) * along
+        at = base + level * along
         T = (1 - share) * take(flat, at) + share * take(flat, at + across)
         value = constant + p * level * table.step + 2 * q * sign * T
         # rising the branch runs over the levels above the threshold, falling over those below it
-        return jnp.where(rising, (level <= fixed) | ((value <= 0) & (level <= L)), (value <= 0) & (level <= fixed))
+        return jnp.where(rising, (level <= fixed) | (value <= 0), (value <= 0) & (level <= fixed))
 
-    # the last level not above the solution: every m-th level first, then those between. Two counts keep the program
-    # small; a bisection written out makes the compiler duplicate each half into the next
-    m = math.isqrt(L) + 1
-    coarse = jnp.sum(not_above(m * jnp.arange(m + 1))) - 1
-    first = jnp.maximum(coarse, 0) * m
-    within = jnp.sum(not_above(first + jnp.arange(1, m))) + first
-    cell = jnp.clip(jnp.where(coarse < 0, -1, within), 0, L - 1)
+    # the last level not above the solution, two levels at once in ever finer strides: where one or three are tried, the
+    # compiler's loops are two to three times slower
+    cell = 0
+    for stride in _strides(L):
+        levels = cell + stride * jnp.arange(1, 3)
+        cell = cell + stride * jnp.sum(not_above(jnp.minimum(levels, L)) & (levels < L))
 
     # in the cell T = first + (second - first - D) z + D z^2; go from the anchor by the distance rho that is left
     first, second = _level_values(table, cell, fixed, share, rising)
@@ -119,10 +145,21 @@ def _locate(table, branch, p, q, rhs):
     b = p * table.step + 2 * q * slope
     z = anchor + sign * 2 * rho / (b + jnp.sqrt(b * b + 8 * q * D * rho))
     v = table.low + (cell + z) * table.step
+    m = m_there + 2 * sign * (first + (second - first - D + D * z) * z)
     # outside the plane every relay is saturated and the equation linear
     m_top = table.offset + table.total
-    v = jnp.where(p * (table.low + L * table.step) + q * m_top < rhs, (rhs - q * m_top) / p, v)
-    return jnp.where(p * table.low + q * table.lowest > rhs, (rhs - q * table.lowest) / p, v)
+    above = p * (table.low + L * table.step) + q * m_top < rhs
+    below = p * table.low + q * table.lowest > rhs
+    m = jnp.where(above, m_top, jnp.where(below, table.lowest, m))
+    return jnp.where(above | below, (rhs - q * m) / p, v), m
+
+
+def _strides(cells):
+    """Strides, coarse to fine, so that two levels tried at each end in one cell of so many."""
+    strides = [1]
+    while 3 * strides[-1] < cells:
+        strides.append(3 * strides[-1])
+    return strides[::-1]
 
 
 def _extra_terms(effects, states, actuator, trial, p, q):
@@ -272,7 +309,7 @@ def _solve_with_effects(table, c, effects, actuator, trial_at, p, q, rhs):
         extra = _extra_terms(frozen_effects, frozen_c.states, frozen_actuator, stop_gradient_trial(trial_at, v, m), pf, qf)[0]
         return pf * v + qf * m + extra - rf, extra
 
-    v0, m0, *_ = solve_branch(frozen_table, frozen_c.memory, pf, qf, rf)
+    v0, *_ = solve_frozen(frozen_table, frozen_c.memory, pf, qf, rf)
     reach = 0.5 * frozen_table.step * frozen_table.cells
 
     def refine(bracket):
@@ -290,8 +327,7 @@ def _solve_with_effects(table, c, effects, actuator, trial_at, p, q, rhs):
     v, *_ = jax.lax.while_loop(unsettled, refine, (v0, v0 - reach, v0 + reach, reach, 0))
     v = stop_gradient(v)
     frozen_extra = stop_gradient(excess(v)[1])
-    v, m, rising, kept = solve_branch(frozen_table, frozen_c.memory, pf, qf, rf - frozen_extra)
-    v, m = stop_gradient((v, m))
+    v, m, rising, kept = solve_frozen(frozen_table, frozen_c.memory, pf, qf, rf - frozen_extra)
     # live polish: the effects' term with its own derivative
     extra_slope = jax.jvp(excess, (v,), (jnp.ones_like(v),))[1][1]
     _, _, threshold, m_there = c.memory.select(table, rising, kept)
