@@ -64,7 +64,11 @@ def alternating(recordings, spectra, output: str) -> Alternation | None:
         size = float(pattern @ wave) / float(wave @ wave)
         weight = float(wave @ wave) / noise
         top, bottom = top + weight * size, bottom + weight
-        power, left, error = power + float(pattern @ pattern), left + float(np.sum((pattern - pattern.mean() - size * wave) ** 2)), error + 1.0
+        power, left, error = (
+            power + float(pattern @ pattern),
+            left + float(np.sum((pattern - pattern.mean() - size * wave) ** 2)),
+            error + 1.0,
+        )
         there = np.interp(cycles % 1.0, np.append(phases, 1.0), np.append(pattern, pattern[0]))
         alternate = np.zeros(len(recording.time))
         alternate[: s.samples] = np.where(np.floor(cycles + 1e-9) % 2 == 0, there, -there)
@@ -74,4 +78,6 @@ def alternating(recordings, spectra, output: str) -> Alternation | None:
     if len(seen) < 2 or shown < RECORDINGS:
         return None
     rms = float(np.sqrt(power / sum(int(s.samples / s.periods) for s in spectra)))
-    return Alternation(float(top / bottom), float(1 / np.sqrt(bottom)), float(1 - left / power), rms, float(np.median(seen)), tuple(cleaned))
+    return Alternation(
+        float(top / bottom), float(1 / np.sqrt(bottom)), float(1 - left / power), rms, float(np.median(seen)), tuple(cleaned)
+    )

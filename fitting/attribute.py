@@ -96,7 +96,9 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
     info = effect_class.parameters()[effect_class.amplitude]
     reach = max(abs(t) for t in info.typical) if info.typical else 10 * info.scale
     amplitude = float(np.clip(candidate.amplitude, -reach, reach))
-    effect = effect_class(**candidate.shapes).with_amplitude(amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale)
+    effect = effect_class(**candidate.shapes).with_amplitude(
+        amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale
+    )
     actuator = base.actuator.with_effect(effect)
     result = fit(
         recordings, bench, actuator=actuator, start=base, extra=effect_parameters(actuator), choices=choices, refine=False, progress=progress,

@@ -87,7 +87,9 @@ def _story(plain, found, folder) -> str:
     for name, true in {**TRUTH, "effects.excess_loss.k": 25.0}.items():
         before = f"{plain.estimate(name).value:12.5g}" if not name.startswith("effects") else " " * 12
         after = next((e for e in fixed.estimates if e.name == name), None) if fixed else None
-        rows.append(f"  {name:28s} {true:10.5g} {before} " + (f"{after.value:12.5g} {after.stderr:9.2g}" if after else "           -"))
+        rows.append(
+            f"  {name:28s} {true:10.5g} {before} " + (f"{after.value:12.5g} {after.stderr:9.2g}" if after else "           -")
+        )
     rows += ["", f"recordings and reports are in {folder} (open {folder}/diagnosis/report.html)"]
     return "\n".join(rows)
 

@@ -43,7 +43,16 @@ class DensityBasis:
         return (self.total * (self.cells @ np.asarray(x))).reshape(self.size, self.size)
 
 
-def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: int = 18, knots_r: int = 13, crowd: float = 1.0, reversible: bool = False) -> DensityBasis:
+def hat_basis(
+    low: float,
+    high: float,
+    total: float,
+    level: int = 80,
+    knots_s: int = 18,
+    knots_r: int = 13,
+    crowd: float = 1.0,
+    reversible: bool = False,
+) -> DensityBasis:
     """Bilinear hats for fields between `low` and `high` (A/m) at level `level`, and the once-switching column.
 
     `crowd` > 1 gathers the knots in the middle of the plane, where soft materials switch; `reversible` adds hats on the
@@ -87,12 +96,19 @@ def hat_basis(low: float, high: float, total: float, level: int = 80, knots_s: i
         columns.append(np.pad(on_diagonal, 1).ravel())
     cells = np.stack(columns, axis=1)
     penalties = [
-        _differences([[number.get((a + d, b)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
-        _differences([[number.get((a, b + d)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]),
+        _differences(
+            [[number.get((a + d, b)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]
+        ),
+        _differences(
+            [[number.get((a, b + d)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]
+        ),
         np.concatenate(
             [
                 _differences(_triples(main, once.shape[1]) + _triples(main + once.shape[1], once.shape[1]), cells.shape[1]),
-                RIDGE * _continuation(low, high, once_knots, s_knots, r_knots, number, main, refine**2 * level / (area * step), cells.shape[1]),
+                RIDGE
+                * _continuation(
+                    low, high, once_knots, s_knots, r_knots, number, main, refine**2 * level / (area * step), cells.shape[1]
+                ),
             ]
         ),
     ]

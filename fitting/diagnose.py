@@ -32,7 +32,17 @@ FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of th
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
-def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choices: Choices = Choices(), progress=None, placebo_runs: int = 0) -> Diagnosis:
+def diagnose(
+    recordings,
+    bench,
+    *,
+    check=(),
+    calibration=(),
+    actuator=None,
+    choices: Choices = Choices(),
+    progress=None,
+    placebo_runs: int = 0,
+) -> Diagnosis:
     """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
@@ -49,7 +59,15 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     spectra = spectra_of(recordings, bench, choices.harmonics)
     say("between the harmonics", 0, None)
     if alternation := alternating(recordings, spectra, bench.output):
-        rest = diagnose(alternation.cleaned, bench, check=check, actuator=actuator, choices=choices, progress=progress, placebo_runs=placebo_runs)
+        rest = diagnose(
+            alternation.cleaned,
+            bench,
+            check=check,
+            actuator=actuator,
+            choices=choices,
+            progress=progress,
+            placebo_runs=placebo_runs,
+        )
         return alternation.told(rest)
     problem = data_problem(recordings, spectra, bench.output)
     if problem:
@@ -68,10 +86,22 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
     cleaned_check = remove_from_checks(check, [e for e, _ in adopted], bench)
     base_now, candidates = _screened_finer(recordings, bench, base_now, candidates, choices, held, progress)
     place = where(base_now, candidates, recordings, bench.output)
-    absorbed = tuple(c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY and abs(c.z) < Z_THRESHOLD)
+    absorbed = tuple(
+        c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY and abs(c.z) < Z_THRESHOLD
+    )
     reached = search(recordings, bench, base_now, candidates, choices, progress, cleaned_check)
     evidence = Evidence(
-        reached, tuple(adopted), base, base_now, tuple(candidates), tuple(recordings), bench, (check, cleaned_check), _floors(base_now), place, absorbed
+        reached,
+        tuple(adopted),
+        base,
+        base_now,
+        tuple(candidates),
+        tuple(recordings),
+        bench,
+        (check, cleaned_check),
+        _floors(base_now),
+        place,
+        absorbed,
     )
     found = verdict(evidence)
     if found.verdict == "unknown_at":
@@ -80,7 +110,9 @@ def diagnose(recordings, bench, *, check=(), calibration=(), actuator=None, choi
         else:
             found = with_learned_term(found, base_now, recordings, bench, cleaned_check, progress)
     if placebo_runs > 0:
-        found = dataclasses.replace(found, placebo=placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress))
+        found = dataclasses.replace(
+            found, placebo=placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress)
+        )
     if zero is not None:
         note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
     elif rival is not None and (found.effects or found.groups):
@@ -150,7 +182,11 @@ def _floors(result) -> dict:
     """Noise, solver and density, rms in the unit of the reading."""
     noise = result.problem.noise_rms
     above = max(result.chi2_per_sample - 1, 0) / max(np.median([s.samples for s in result.spectra]), 1)
-    return {"noise_rms": noise, "solver_rms": solver_floor(result.problem, result.solution), "density_rms": float(noise * np.sqrt(above))}
+    return {
+        "noise_rms": noise,
+        "solver_rms": solver_floor(result.problem, result.solution),
+        "density_rms": float(noise * np.sqrt(above)),
+    }
 
 
 def _rough(evidence, checks) -> bool:

@@ -74,7 +74,13 @@ def next_experiment(trials, spectra, bench, also=()) -> dict | None:
         odds = np.minimum(ndtr(0.5 * apart[best]), 0.99)
         sine = f"four settled periods of {A:.3g} {unit} at {f:.4g} Hz about {offset:.3g} {unit}"
         if odds.min() >= SURE or not wanted:
-            found["drive"] = {"kind": "sine", "frequency_Hz": float(f), "amplitude": float(A), "offset": float(offset), "periods": PERIODS}
+            found["drive"] = {
+                "kind": "sine",
+                "frequency_Hz": float(f),
+                "amplitude": float(A),
+                "offset": float(offset),
+                "periods": PERIODS,
+            }
             found["separates"] = [[a, b, float(p)] for (a, b), p in zip(_pairs(names), odds, strict=True) if a == names[0]]
             parts.append(f"{sine}: separates {names[0]} from {names[1]} with probability {odds.min():.2f}")
         else:
@@ -132,13 +138,17 @@ def _predicted(result, drives, spectra):
     problem, solution = result.problem, result.refined
     wanted = [_asked(spectra[0], *drive) for drive in drives]
     coarse = problem.predictors[0]
-    predictor = Predictor.build(wanted, min(d.shape[1] for d in coarse.drives), coarse.harmonics, coarse.periods, max(coarse.corners, 4))
+    predictor = Predictor.build(
+        wanted, min(d.shape[1] for d in coarse.drives), coarse.harmonics, coarse.periods, max(coarse.corners, 4)
+    )
     deviations = np.stack([line_deviations(s, s.noise)[: coarse.harmonics + 1] for s in wanted])
     deviations[:, 0] = np.where(np.isinf(np.asarray(problem.target.deviations)[0, 0]), np.inf, deviations[:, 0])
     m, count = deviations.shape
     zero = jnp.zeros((m, count), complex)
     target = eqx.tree_at(
-        lambda t: (t.lines, t.deviations, t.gain_rows, t.gain_shares), problem.target, (zero, jnp.asarray(deviations), zero, jnp.zeros((m, m)))
+        lambda t: (t.lines, t.deviations, t.gain_rows, t.gain_shares),
+        problem.target,
+        (zero, jnp.asarray(deviations), zero, jnp.zeros((m, m))),
     )
     r, J = (np.asarray(x) for x in _lines_and_slopes(problem.layout, jnp.asarray(solution.z), target, problem.template, predictor))
     at = [np.concatenate([k * count + np.arange(count), m * count + k * (count - 1) + np.arange(count - 1)]) for k in range(m)]

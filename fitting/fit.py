@@ -26,7 +26,19 @@ VALLEY = 0.98  # correlation from which two parameters are one
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
-def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choices(), progress=None, refine: bool | float = True, start=None, target: float = np.inf, spectra=None) -> FitResult:
+def fit(
+    recordings,
+    bench,
+    *,
+    actuator=None,
+    extra=(),
+    choices: Choices = Choices(),
+    progress=None,
+    refine: bool | float = True,
+    start=None,
+    target: float = np.inf,
+    spectra=None,
+) -> FitResult:
     """Fit an actuator to recordings jointly.
 
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
@@ -51,7 +63,9 @@ def fit(recordings, bench, *, actuator=None, extra=(), choices: Choices = Choice
             progress(text, step, chi2)
 
     start = None if start is not None and _changes_scale(bench, names, start) else start
-    problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), _density(start))
+    problem, z = build_problem(
+        spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), _density(start)
+    )
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
@@ -102,7 +116,9 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
             known, z = build_problem(spectra, actuator, bench, names, tried, _density(start)) if posed is None else posed
             same = start is not None and start.problem.layout.density_unknowns == known.layout.density_unknowns
             weights = start.solution.weights if same else START_WEIGHTS[: len(known.layout.penalties)]
-            found = solve(known, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: say("fit", k, c))
+            found = solve(
+                known, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: say("fit", k, c)
+            )
             return known, found, tried
 
         return one
@@ -235,7 +251,9 @@ def unsettled(spectra) -> str:
 def outcome(chi2n, rows, solution, parameters, problem) -> str:
     """What the fit means, with its remedy."""
     if not solution.converged:
-        return f"stopped after {solution.jacobians} Jacobians before it settled; raise the limit or start nearer (see the bench file)"
+        return (
+            f"stopped after {solution.jacobians} Jacobians before it settled; raise the limit or start nearer (see the bench file)"
+        )
     worst = max(rows, key=lambda r: r.chi2_per_sample)
     bound = [e.name for e in parameters if e.at_bound]
     if bound:

@@ -73,7 +73,9 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
         z, tones, fits = _hum(spectra, f)
         if "mains_hum" not in found or z > found["mains_hum"].z:
             error = tones[0][1] / max(z, 1.0)
-            found["mains_hum"] = RecordEffect("mains_hum", float(z), tones[0][1], float(error), {"f": f, "tones": tones}, tuple(fits))
+            found["mains_hum"] = RecordEffect(
+                "mains_hum", float(z), tones[0][1], float(error), {"f": f, "tones": tones}, tuple(fits)
+            )
     return sorted(found.values(), key=lambda e: -abs(e.z))
 
 
@@ -265,7 +267,11 @@ def wrong_bench(result) -> str | None:
     for s in result.spectra:
         if len(s.reading) > 1 and abs(s.drive[1]) > 0:
             correlation.append(np.angle(s.reading[1] / s.drive[1]))
-    slow = [c for c, s in zip(correlation, result.spectra, strict=True) if s.frequency <= min(x.frequency for x in result.spectra) * 1.01]
+    slow = [
+        c
+        for c, s in zip(correlation, result.spectra, strict=True)
+        if s.frequency <= min(x.frequency for x in result.spectra) * 1.01
+    ]
     if slow and all(abs(c) > 0.75 * np.pi for c in slow) and not result.chi2_per_sample <= 20:  # a fit that broke down too
         return "the reading falls where the drive rises at the lowest frequency: the sign of a channel is swapped; set scale = -1 in [columns]"
     return None

@@ -24,10 +24,21 @@ from .spectra import line_deviations, reduce_recording, with_noise
 
 SECOND_ORDER = 0.05  # order2 from which a sensor's filter is one of second order
 RINGING = 0.5  # damping below which a filter is no instrument's
-NOT_LINEAR = {"duffing_stiffness", "delta_e", "coulomb_friction", "backlash", "sensor_nonlinearity", "stress_feedback"}  # between rod and sensor
+NOT_LINEAR = {
+    "duffing_stiffness",
+    "delta_e",
+    "coulomb_friction",
+    "backlash",
+    "sensor_nonlinearity",
+    "stress_feedback",
+}  # between rod and sensor
 STRONG = 1e-3  # of the strongest line: weaker ones tell no gain
 FINEST = 1e-5  # relative; no gain is taken for better known
-START_GRID = {"mechanics.f0": (1.0, 2.0, 4.0, 8.0, 16.0), "mechanics.xi": (1.0, 0.2), "coil.R_eddy": (1.0, 4.0)}  # of the bench's word
+START_GRID = {
+    "mechanics.f0": (1.0, 2.0, 4.0, 8.0, 16.0),
+    "mechanics.xi": (1.0, 0.2),
+    "coil.R_eddy": (1.0, 4.0),
+}  # of the bench's word
 SETTLES = {"source": ("amplifier_lag", "amplifier_clipping"), "sensor": ("sensor_lag", "transport_delay")}
 
 
@@ -75,7 +86,9 @@ def line_gains(recordings, drive: str, output: str, columns=None):
     rows = []
     for s in with_noise([reduce_recording(r, drive, output, columns=columns) for r in recordings]):
         size = np.abs(s.drive[: len(s.reading)])
-        deviation = np.hypot(line_deviations(s, s.noise), s.drive_noise / np.sqrt(2 * s.samples) * np.abs(s.reading[1]) / size[1:].max())
+        deviation = np.hypot(
+            line_deviations(s, s.noise), s.drive_noise / np.sqrt(2 * s.samples) * np.abs(s.reading[1]) / size[1:].max()
+        )
         for h in np.flatnonzero(size > STRONG * size[1:].max()):
             if h > 0:
                 gain = s.reading[h] / s.drive[h]
@@ -107,7 +120,11 @@ def measured_source(recordings, bench) -> Instrument | None:
         order = "second" if "order2" in best.parameters else "first"
         text = f"The measured current lags its command by {size} as an amplifier of {order} order does: amplifier_lag (source)."
         return Instrument("source", verdict, "amplifier_lag", best.parameters, text)
-    what = f"a lag of {size}, a delay or a first-order one" if verdict in ("delay", "group") else "something else than a first-order lag"
+    what = (
+        f"a lag of {size}, a delay or a first-order one"
+        if verdict in ("delay", "group")
+        else "something else than a first-order lag"
+    )
     text = f"Between command and measured current stands {what}; the measured current drives the model."
     return Instrument("source", verdict, None, {}, text)
 
@@ -130,11 +147,17 @@ def measured_sensor(calibrations, bench) -> Instrument | None:
         )
     verdict, best, _ = judge_laws(fit_laws(w, gain, error, SENSOR_LAWS))
     reach = f"up to {w.max() / 2 / np.pi:.4g} Hz"
-    scale = "" if abs(best.gain - 1) < 0.002 else f" Its scale is {best.gain:.5g} of what the bench file says; mend it in [columns.{bench.output}]."
+    scale = (
+        ""
+        if abs(best.gain - 1) < 0.002
+        else f" Its scale is {best.gain:.5g} of what the bench file says; mend it in [columns.{bench.output}]."
+    )
     if verdict == "follows":
         return Instrument("sensor", verdict, None, {}, f"By its calibration the sensor follows {reach}.{scale}")
     if verdict == "unknown":
-        text = f"The calibration {reach} is met by no filter of first or second order and no delay; the sensor stays unknown.{scale}"
+        text = (
+            f"The calibration {reach} is met by no filter of first or second order and no delay; the sensor stays unknown.{scale}"
+        )
         return Instrument("sensor", verdict, None, {}, text)
     words = ", ".join(f"{k} = {v:.5g} ± {e:.2g}{' s' if k == 'tau' else ''}" for k, (v, e) in best.parameters.items())
     text = f"By its calibration the sensor has {filter_words(**{k: v for k, (v, _) in best.parameters.items()})} ({words}): {best.law} (sensor).{scale}"
@@ -183,7 +206,10 @@ def exchange(result, bench) -> tuple[str, bool] | None:
         "without any change of the reading"
     )
     if damping < RINGING:
-        return f"{text}, and no instrument's filter rings like that: the rod may be what rings. By these channels instruments and actuator are not told apart.", True
+        return (
+            f"{text}, and no instrument's filter rings like that: the rod may be what rings. By these channels instruments and actuator are not told apart.",
+            True,
+        )
     return f"{text}: f0 and xi are the rod's only if this is the right way round.", False
 
 
@@ -248,7 +274,9 @@ def diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices
 def _joined(known, found, plain, final, check_plain, check, bench, texts):
     """The inner verdict with the instruments named beside it and the plain model as the base."""
     units = {"tau": "s", "order2": "1"}
-    shifts = {e.name: [e.value, final.estimate(e.name).value] for e in plain.estimates if e.free and not e.name.startswith("effects.")}
+    shifts = {
+        e.name: [e.value, final.estimate(e.name).value] for e in plain.estimates if e.free and not e.name.startswith("effects.")
+    }
     rows = [
         {
             "name": i.name, "block": i.block, "confidence": 0.99, "shifts": shifts,
@@ -257,18 +285,32 @@ def _joined(known, found, plain, final, check_plain, check, bench, texts):
         for i in known if i.name
     ]  # fmt: skip
     checks = []
-    for before, after in zip(check_errors(plain.actuator, plain.actuator, check_plain, bench), check_errors(final.actuator, final.actuator, check, bench), strict=True):
+    for before, after in zip(
+        check_errors(plain.actuator, plain.actuator, check_plain, bench),
+        check_errors(final.actuator, final.actuator, check, bench),
+        strict=True,
+    ):
         checks.append({**after, "rms_before": before["rms_before"]})
     verdict = "attributed" if found.verdict in ("nothing_missing", "absorbed") else found.verdict
     constants = ", ".join(
         f"{e.name} = {e.value:.4g} ± {e.stderr:.2g}{'' if e.unit == '1' else ' ' + e.unit}" for e in map(final.estimate, shifts)
     )
     named = " and ".join(r["name"] for r in rows)
-    text = f"{texts} With {named} in place chi2/N falls from {plain.chi2_per_sample:.3g} to {final.chi2_per_sample:.2f}; {constants}."
+    text = (
+        f"{texts} With {named} in place chi2/N falls from {plain.chi2_per_sample:.3g} to {final.chi2_per_sample:.2f}; {constants}."
+    )
     if checks:
-        better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in checks)
+        better = "; ".join(
+            f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in checks
+        )
         text += f" On check recordings: {better}."
     rest = "Beyond that nothing is missing." if found.verdict == "nothing_missing" else f"Beyond that: {found.message}"
     return dataclasses.replace(
-        found, verdict=verdict, message=f"{text} {rest}", effects=(*rows, *found.effects), base=plain, repaired=final, check=tuple(checks)
+        found,
+        verdict=verdict,
+        message=f"{text} {rest}",
+        effects=(*rows, *found.effects),
+        base=plain,
+        repaired=final,
+        check=tuple(checks),
     )

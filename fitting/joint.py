@@ -21,7 +21,11 @@ from .solver import damped_step, pushed
 WEIGHT_RANGE = (1e-3, 1e9)
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
 STALLED, STALL = 6, 1e-3  # Jacobians, and the share of chi2 that they must take
-AT_END = (4, 1.0, 5e-4)  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
+AT_END = (
+    4,
+    1.0,
+    5e-4,
+)  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
 PROMISED = 1e-2  # share of half chi2 that may still be promised there: a kink, or the coarse Jacobian, keeps it
 CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
 BEND = 0.2  # of the step, over which its curvature is taken
@@ -55,7 +59,9 @@ class Problem:
         unknowns stand in z. All fits that differ in those effects alone share its compiled program, the larger part by far."""
         template = self.template
         behind = {e.name for e in template.effects if not e.marches}
-        layout, place = self.layout.without({n for n in self.layout.names if n.startswith("effects.") and n.split(".")[1] in behind})
+        layout, place = self.layout.without(
+            {n for n in self.layout.names if n.startswith("effects.") and n.split(".")[1] in behind}
+        )
         return layout, dataclasses.replace(template, effects=tuple(e for e in template.effects if e.marches)), place
 
     def with_weights(self, weights) -> "Problem":
@@ -169,7 +175,9 @@ def bent_step(problem: Problem, z, new, residual, J, normal, damping):
     return np.where(problem.layout.nonnegative, np.maximum(bent, 0.0), bent)
 
 
-def solve(problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None, target: float = np.inf) -> Solution:
+def solve(
+    problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None, target: float = np.inf
+) -> Solution:
     """Minimise from z, one Jacobian and a few trial dampings a step.
 
     The steps are those of `ProjectedLevenbergMarquardt`, driven from Python with the two compiled functions that the

@@ -103,7 +103,9 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
         first = problem.layout.index(names[len(base.problem.layout.names)])
         index = slice(first, first + len(term.coefficients))
         cov = covariance(solution.normal, solution.z, n)
-        values = np.array([float(problem.layout.value(name, jnp.asarray(solution.z))) for name in names[len(base.problem.layout.names) :]])
+        values = np.array(
+            [float(problem.layout.value(name, jnp.asarray(solution.z))) for name in names[len(base.problem.layout.names) :]]
+        )
         slopes = np.asarray(problem.layout.scales)[index.start - n - 1 : index.stop - n - 1]
         spread = cov[index, index] * slopes[:, None] * slopes
         deviation = np.asarray(term.deviation)
@@ -175,7 +177,10 @@ def band(learned: Learned, *values):
     rows = waves.reshape(len(waves), -1) - middle[:, None]
     size = float(term.size)
     value = size * (np.array([float(c) for c in term.coefficients]) @ rows)
-    variance = np.einsum("ki,kl,li->i", rows, learned.covariance, rows, optimize=True) + np.sum(outside.reshape(len(outside), -1) ** 2, axis=0) / learned.place.length**2
+    variance = (
+        np.einsum("ki,kl,li->i", rows, learned.covariance, rows, optimize=True)
+        + np.sum(outside.reshape(len(outside), -1) ** 2, axis=0) / learned.place.length**2
+    )
     return value.reshape(shape), size * np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
 
 
@@ -196,7 +201,9 @@ def _sensitivities(actuator, drive, dt, periods, corners):
 
 def prediction_interval(learned: Learned, drive, dt: float, periods: int = 3, corners: int = 8):
     """One settled period of the reading on a periodic drive, and its standard deviation by what the term leaves open."""
-    value, rows = (np.asarray(x) for x in _sensitivities(learned.result.actuator, jnp.asarray(drive), jnp.asarray(dt), periods, corners))
+    value, rows = (
+        np.asarray(x) for x in _sensitivities(learned.result.actuator, jnp.asarray(drive), jnp.asarray(dt), periods, corners)
+    )
     number = len(learned.term.coefficients)
     ends = np.sum(rows[number:] ** 2, axis=0) / learned.place.length**2
     return value, np.sqrt(np.einsum("ki,kl,li->i", rows[:number], learned.covariance, rows[:number], optimize=True) + ends)
@@ -207,7 +214,9 @@ def region(learned: Learned):
     curvature. A constant and a slope are what the base can take up; where the function bends is what it cannot."""
     term = learned.term
     first = np.linspace(float(term.low[0]), float(term.high[0]), 201)
-    levels = [[]] if len(term.variables) == 1 else [[float(term.low[1] + s * (term.high[1] - term.low[1]))] for s in (0.1, 0.5, 0.9)]
+    levels = (
+        [[]] if len(term.variables) == 1 else [[float(term.low[1] + s * (term.high[1] - term.low[1]))] for s in (0.1, 0.5, 0.9)]
+    )
     bend = [np.gradient(np.gradient(band(learned, first, *(np.full_like(first, v) for v in level))[0])) for level in levels]
     power = np.sum(np.square(bend), axis=0)
     power[:6] = power[-6:] = 0.0  # the ends are the least known
@@ -230,7 +239,14 @@ def described(learned: Learned) -> dict:
     slices = []
     for level in levels:
         value, deviation = band(learned, *([x] if level is None else [x, np.full_like(x, level)]))
-        slices.append({"at": level, "value": value.tolist(), "low": (value - 1.96 * deviation).tolist(), "high": (value + 1.96 * deviation).tolist()})
+        slices.append(
+            {
+                "at": level,
+                "value": value.tolist(),
+                "low": (value - 1.96 * deviation).tolist(),
+                "high": (value + 1.96 * deviation).tolist(),
+            }
+        )
     unit = OUTPUTS[term.place]
     unit = {"m": "m", "T": "T"}.get(learned.result.recordings[0].unit, "A/m") if unit == "reading" else unit
     units = [UNITS[v].replace("reading", learned.result.recordings[0].unit) for v in term.variables]
@@ -258,15 +274,24 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None):
     it, check recordings before and after. `found`: a `Diagnosis`; `base`: the fit that it stands beside."""
     learned = learn(base, recordings, bench, progress)
     if learned is None:
-        return dataclasses.replace(found, message=found.message + " No smooth function of the signals there foretells recordings left out any better.")
+        return dataclasses.replace(
+            found, message=found.message + " No smooth function of the signals there foretells recordings left out any better."
+        )
     rows = tuple(check_errors(found.base.actuator, learned.result.actuator, check, bench)) if check else ()
     gained = [r["rms_after"] / max(r["rms_before"], 1e-300) for r in rows]
     if gained and np.mean(np.square(gained)) > 1:
-        return dataclasses.replace(found, message=found.message + " A smooth function learned from them predicts the check recordings worse, so it is not kept.")
+        return dataclasses.replace(
+            found,
+            message=found.message + " A smooth function learned from them predicts the check recordings worse, so it is not kept.",
+        )
     more = described(learned)
     start, end, part = region(learned)
     place, unit = learned.place, more["variable_units"][0]
-    where = f"all over the range of the {words(place.variables[0])}" if part > 0.6 else f"{words(place.variables[0])} {start:.3g} .. {end:.3g} {unit}"
+    where = (
+        f"all over the range of the {words(place.variables[0])}"
+        if part > 0.6
+        else f"{words(place.variables[0])} {start:.3g} .. {end:.3g} {unit}"
+    )
     unknown = {**(found.unknown or {}), "block": place.block, "region": where, **more}
     nearest = f"{learned.share:.0%} of the excess"
     text = (

@@ -29,7 +29,9 @@ def where(result, candidates, recordings, output) -> dict:
         share = np.clip(((drive - drive.min()) / np.ptp(drive) * 4).astype(int), 0, 3)
         for q in range(4):
             field[q].append(misfit[share == q])
-        y = np.asarray(recordings[k].channels[output])[: s.samples] - evaluate_lines(s.reading, np.arange(s.samples) * s.dt * s.frequency)
+        y = np.asarray(recordings[k].channels[output])[: s.samples] - evaluate_lines(
+            s.reading, np.arange(s.samples) * s.dt * s.frequency
+        )
         period.append([float(np.sqrt(np.mean(b**2))) for b in np.array_split(y, s.periods)])
 
     def rms(parts):

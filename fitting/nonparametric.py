@@ -66,10 +66,20 @@ def _signals(predictor, actuator):
     def one(drive, dt):
         s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners)
         line = Timeline(dt, drive.shape[0], True)
-        found = {"current": s.current, "field": s.relay_field, "coil_field": s.field, "magnetization": s.magnetization, "reading": s.reading}
+        found = {
+            "current": s.current,
+            "field": s.relay_field,
+            "coil_field": s.field,
+            "magnetization": s.magnetization,
+            "reading": s.reading,
+        }
         if s.displacement is not None:
             found |= {"displacement": s.displacement, "stretch": s.displacement - s.free_displacement}
-        rates = {f"{n}_rate": line.derivative(found[n]) for n in ("current", "field", "magnetization", "displacement", "reading") if n in found}
+        rates = {
+            f"{n}_rate": line.derivative(found[n])
+            for n in ("current", "field", "magnetization", "displacement", "reading")
+            if n in found
+        }
         return {**found, **rates, "flux_rate": line.derivative(s.flux_density)}
 
     return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
@@ -257,7 +267,9 @@ def locate_places(result, say=lambda *a: None) -> list[Place]:
                 if gain < found[-1].evidence + FINER_GAIN:
                     continue
                 found.pop()
-            found.append(Place(block, variables, gain, share, length, size * float(term.size), visible, _with_prior(term, length, size)))
+            found.append(
+                Place(block, variables, gain, share, length, size * float(term.size), visible, _with_prior(term, length, size))
+            )
     return sorted(found, key=lambda p: -p.evidence)
 
 

@@ -56,7 +56,9 @@ class FitResult:
         lines += [f"  {e}" for e in self.estimates if e.free]
         lines += ["", f"  {'recording':30s} {'f / Hz':>8s} {'noise':>10s} {'residual':>10s} {'chi2/N':>8s}"]
         for r in self.recordings:
-            lines.append(f"  {Path(r.file).name[:30]:30s} {r.frequency:8.4g} {r.noise_rms:10.3g} {r.residual_rms:10.3g} {r.chi2_per_sample:8.3g}")
+            lines.append(
+                f"  {Path(r.file).name[:30]:30s} {r.frequency:8.4g} {r.noise_rms:10.3g} {r.residual_rms:10.3g} {r.chi2_per_sample:8.3g}"
+            )
         lines.append("")
         lines.append(
             f"  chi2/N = {self.chi2_per_sample:.3g} over {self.data_count} numbers, about {self.unknowns:.0f} effective unknowns, "

@@ -67,7 +67,15 @@ def shape_grid(effect_class):
     return grid
 
 
-RATE_FREE = ("mean_field", "reversible_magnetization", "accommodation", "quartic_magnetostriction", "linear_strain", "strain_hysteresis", "sensor_nonlinearity")
+RATE_FREE = (
+    "mean_field",
+    "reversible_magnetization",
+    "accommodation",
+    "quartic_magnetostriction",
+    "linear_strain",
+    "strain_hysteresis",
+    "sensor_nonlinearity",
+)
 
 
 def applicable(actuator, quasistatic: bool = False):
@@ -185,9 +193,13 @@ def columns(problem, z):
     found = []
     late = [c for c in classes if not c.in_step and c.block != "source"]
     if late:
-        stacked = tuple(jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shape_grid(c))) for c in late)
+        stacked = tuple(
+            jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shape_grid(c))) for c in late
+        )
         lines = _late_columns(predictor, actuator, _steady_state(predictor, actuator), stacked)
-        found += [(c, shapes, line) for c, of in zip(late, lines, strict=True) for shapes, line in zip(shape_grid(c), of, strict=True)]
+        found += [
+            (c, shapes, line) for c, of in zip(late, lines, strict=True) for shapes, line in zip(shape_grid(c), of, strict=True)
+        ]
     marching = [(c, shapes) for c in classes if c.in_step and not c.shells for shapes in shape_grid(c)]
     drives = [np.asarray(d) for d in predictor.drives]
     sources = [
@@ -197,7 +209,9 @@ def columns(problem, z):
         trajectory = _trajectory(predictor, actuator)
         rows = []
         for c, shapes in marching:
-            rows.append((_disturbance(c(**shapes), predictor, actuator, trajectory), tuple(jnp.zeros_like(d) for d in predictor.drives)))
+            rows.append(
+                (_disturbance(c(**shapes), predictor, actuator, trajectory), tuple(jnp.zeros_like(d) for d in predictor.drives))
+            )
         still = tuple(tuple(jnp.zeros_like(part[0]) for _ in range(3)) for part in trajectory)
         for c, shapes in sources:
             finite = c.amplitude in shapes
@@ -207,7 +221,9 @@ def columns(problem, z):
         found += [(c, s, line) for (c, s), line in zip(marching + sources, lines, strict=True)]
     for c in classes:
         for shapes in c.finite_trials(drives, predictor.steps) if c.shells else ():
-            found.append((c, shapes, predicted_lines(predictor, actuator.with_effect(c(**shapes))) - predicted_lines(predictor, actuator)))
+            found.append(
+                (c, shapes, predicted_lines(predictor, actuator.with_effect(c(**shapes))) - predicted_lines(predictor, actuator))
+            )
     zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
     return [(c, s, np.asarray(whitened(line, zero))) for c, s, line in found]
 

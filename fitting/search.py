@@ -36,7 +36,10 @@ from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
-NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
+NEAR_RIVAL, MOST_RIVALS = (
+    0.3,
+    4,
+)  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
@@ -173,7 +176,15 @@ def _exchange(recordings, bench, state, chosen, progress):
         if not near or best.name not in {e.name for e in state.current.actuator.effects}:
             continue
         rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
-        own = Trial(best.candidate, state.current, 0.0, best.parameters * np.log(rest.data_count), True, best.explained_share, best.parameters)
+        own = Trial(
+            best.candidate,
+            state.current,
+            0.0,
+            best.parameters * np.log(rest.data_count),
+            True,
+            best.explained_share,
+            best.parameters,
+        )
         trials = [own]
         near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
 

@@ -106,7 +106,9 @@ def pushed(push, directions, chunk: int = CHUNK):
     chunks = -(-n // chunk)
     chunk = -(-n // chunks)  # all of one size: a smaller rest would be compiled once more
     rest = chunks * chunk - n
-    parts = jax.tree.map(lambda d: jnp.concatenate([d, jnp.zeros((rest, *d.shape[1:]))]).reshape(chunks, chunk, *d.shape[1:]), directions)
+    parts = jax.tree.map(
+        lambda d: jnp.concatenate([d, jnp.zeros((rest, *d.shape[1:]))]).reshape(chunks, chunk, *d.shape[1:]), directions
+    )
     rows = jax.lax.map(jax.vmap(push), parts)
     return jax.tree.map(lambda r: r.reshape(chunks * chunk, *r.shape[2:])[:n], rows)
 

@@ -82,7 +82,7 @@ def inferred_loops(spectra, deviations, actuator, samples: int = 200):
         applied = np.asarray(coil.applied_field(s.drive_at(phases)))
         count = min(len(s.reading), samples // 2 - 1)
         keep = np.abs(s.reading[:count]) > 4 * sigma[:count]
-        keep[: 3] = True
+        keep[:3] = True
         w = 2j * np.pi * s.frequency * np.arange(count)
         lines = np.where(keep, s.reading[:count], 0.0)
         if actuator.output == "displacement":

@@ -63,7 +63,9 @@ def load_curves(paths, bench) -> Curves:
         row = read_columns(path, bench, ("flux_density", "field", "magnetization", "strain", "stress"))
         if "magnetization" not in row:
             if not {"flux_density", "field"} <= set(row):
-                raise RecordingError(f"{path}: strain needs a magnetization, or flux density and field; map their columns in the bench file")
+                raise RecordingError(
+                    f"{path}: strain needs a magnetization, or flux density and field; map their columns in the bench file"
+                )
             row["magnetization"] = row["flux_density"] / MU0 - row["field"]
         if not all(np.all(np.isfinite(v)) for v in row.values()):
             raise RecordingError(f"{path}: a column holds a value that is no number; mend or drop its row")
@@ -165,12 +167,20 @@ def strain_verdict(curves: Curves) -> dict:
         content["message"] = f"the square law serves: {square.held_out:.3g} rms on curves left out, of {spread:.3g}."
         return content
     without = min((law.held_out for law in tried.values() if law.variable is None), default=square.held_out)
-    parameters = {f"g{k}": {"value": float(v), "stderr": None, "unit": "1"} for k, v in zip(best.powers, best.coefficients[0], strict=True)}
+    parameters = {
+        f"g{k}": {"value": float(v), "stderr": None, "unit": "1"} for k, v in zip(best.powers, best.coefficients[0], strict=True)
+    }
     text = f"the square law is found wanting: {square.held_out:.3g} rms on curves left out, of {spread:.3g}. "
     if best.variable:
         unit = {"stress": "Pa", "field": "A/m", "flux_density": "T"}[best.variable]
-        parameters |= {f"d{k}": {"value": float(v), "stderr": None, "unit": "1"} for k, v in zip(best.powers, best.coefficients[1], strict=True)}
-        parameters |= {"center": {"value": best.center, "stderr": None, "unit": unit}, "width": {"value": best.width, "stderr": None, "unit": unit}}
+        parameters |= {
+            f"d{k}": {"value": float(v), "stderr": None, "unit": "1"}
+            for k, v in zip(best.powers, best.coefficients[1], strict=True)
+        }
+        parameters |= {
+            "center": {"value": best.center, "stderr": None, "unit": unit},
+            "width": {"value": best.width, "stderr": None, "unit": unit},
+        }
         rivals = [law.held_out for law in tried.values() if law.variable not in (None, best.variable)]
         text += (
             f"The variable is {best.variable}: coefficients that pass over at {best.center:.3g} {unit} within {best.width:.3g} {unit} leave "
@@ -202,8 +212,20 @@ def draw_strain(curves: Curves, law: StrainLaw, square: StrainLaw, path) -> None
         axis.plot(M / 1e3, 1e6 * curves.strain[rows], ".", ms=3, color=colour)
         axis.plot(M / 1e3, 1e6 * law(M / curves.saturation, u), "-", lw=1, color=colour)
     M = np.linspace(0, np.max(curves.magnetization), 200)
-    axis.plot(M / 1e3, 1e6 * square(M / curves.saturation), "k--", lw=1.2, label=f"square law, {square.held_out * 1e6:.2g} ppm on curves left out")
-    axis.plot([], [], "-", color="0.4", label=f"{law.name}" + (f" with {law.variable}" if law.variable else "") + f", {law.held_out * 1e6:.2g} ppm")
+    axis.plot(
+        M / 1e3,
+        1e6 * square(M / curves.saturation),
+        "k--",
+        lw=1.2,
+        label=f"square law, {square.held_out * 1e6:.2g} ppm on curves left out",
+    )
+    axis.plot(
+        [],
+        [],
+        "-",
+        color="0.4",
+        label=f"{law.name}" + (f" with {law.variable}" if law.variable else "") + f", {law.held_out * 1e6:.2g} ppm",
+    )
     axis.set(xlabel="magnetization (kA/m)", ylabel="strain (ppm)", title="Strain curves (dots) and the law that serves (lines)")
     axis.legend()
     figure.savefig(path, dpi=130)

@@ -234,7 +234,9 @@ def _grouped(evidence, common, effects, groups, rivals, swap, asked) -> Diagnosi
 
 def _attributed(evidence, common, effects, swap, asked) -> Diagnosis:
     named = " and ".join(f"{e['name']} ({e['block']})" for e in effects)
-    better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in common["check"])
+    better = "; ".join(
+        f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in common["check"]
+    )
     text = f"{named} {'was' if len(effects) == 1 else 'were'} left out: {_fall(evidence)}."
     text += f" On check recordings: {better}." if better else " Record a check at another frequency to confirm it."
     if swap:
@@ -266,7 +268,9 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
 
 def _effect_row(trial, tried, previous, final) -> dict:
     result = final if any(e.name == trial.name for e in final.actuator.effects) else trial.result
-    shifts = {e.name: [e.value, result.estimate(e.name).value] for e in previous.estimates if e.free and not e.name.startswith("effects.")}
+    shifts = {
+        e.name: [e.value, result.estimate(e.name).value] for e in previous.estimates if e.free and not e.name.startswith("effects.")
+    }
     return {
         "name": trial.name, "block": trial.candidate.block, "parameters": _sizes(trial.name, result),
         "confidence": confidence(trial, tried), "shifts": shifts,
@@ -276,7 +280,11 @@ def _effect_row(trial, tried, previous, final) -> dict:
 def _sizes(name, result) -> dict:
     """The parameters of an effect as a fit has them."""
     prefix = f"effects.{name}."
-    return {e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit} for e in result.estimates if e.name.startswith(prefix)}
+    return {
+        e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit}
+        for e in result.estimates
+        if e.name.startswith(prefix)
+    }
 
 
 def _record_row(effect) -> dict:

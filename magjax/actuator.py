@@ -129,7 +129,9 @@ def from_bench(bench) -> Actuator:
     masses = tan_baras_density(cells, low, high, 0.5 * M_s)
     hysteresis = Preisach(masses, low, high, 0.5 * M_s, start)
     known = (SensorLag(constants["sensor.tau"], constants.get("sensor.order2", 0.0)),) if "sensor.tau" in constants else ()
-    return Actuator(coil, hysteresis, magnetostriction, mechanics, sensor=block(Sensor, "sensor"), effects=known, output=bench.output)
+    return Actuator(
+        coil, hysteresis, magnetostriction, mechanics, sensor=block(Sensor, "sensor"), effects=known, output=bench.output
+    )
 
 
 def _plane(bench, coil):

@@ -23,8 +23,34 @@ OTHER_KEYS = {
     "limits": ("current_A", "field_A_per_m"),
     "fit": ("free", "output", "priors"),
 }
-COLUMN_KEYS = ("name", "scale", "offset", "unit", "split", "merge", "quasistatic", "emf_turns", "emf_area", "emf_sign", "bits", "gain_accuracy")
-QUANTITIES = ("time", "current", "command", "field", "displacement", "reference", "flux_density", "magnetization", "voltage", "temperature", "strain", "stress")
+COLUMN_KEYS = (
+    "name",
+    "scale",
+    "offset",
+    "unit",
+    "split",
+    "merge",
+    "quasistatic",
+    "emf_turns",
+    "emf_area",
+    "emf_sign",
+    "bits",
+    "gain_accuracy",
+)
+QUANTITIES = (
+    "time",
+    "current",
+    "command",
+    "field",
+    "displacement",
+    "reference",
+    "flux_density",
+    "magnetization",
+    "voltage",
+    "temperature",
+    "strain",
+    "stress",
+)
 STARTS = ("auto", "demagnetized", "negative_saturation", "positive_saturation")
 
 
@@ -93,7 +119,9 @@ def _check_keys(content, path):
                     raise ConfigurationError(f"bench {path}: [columns.{quantity}] is unknown{_suggest(quantity, QUANTITIES)}")
                 for inner in column:
                     if inner not in COLUMN_KEYS:
-                        raise ConfigurationError(f"bench {path}: columns.{quantity}.{inner} is unknown{_suggest(inner, COLUMN_KEYS)}")
+                        raise ConfigurationError(
+                            f"bench {path}: columns.{quantity}.{inner} is unknown{_suggest(inner, COLUMN_KEYS)}"
+                        )
             continue
         if key not in sections:
             raise ConfigurationError(f"bench {path}: [{key}] is unknown{_suggest(key, (*sections, 'columns', 'name'))}")
@@ -141,7 +169,9 @@ def _build(content, path) -> Bench:
         for key, top in (("bits", 32), ("gain_accuracy", 0.5)):
             value = column.get(key, 1)
             if key in column and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= top):
-                raise ConfigurationError(f"bench {path}: columns.{quantity}.{key} = {value!r}; give a number above 0 and up to {top}")
+                raise ConfigurationError(
+                    f"bench {path}: columns.{quantity}.{key} = {value!r}; give a number above 0 and up to {top}"
+                )
     priors = {str(k): float(v) for k, v in fit.get("priors", {}).items()}
     if "sensor.order2" in constants and "sensor.tau" not in constants:
         raise ConfigurationError(f"bench {path}: sensor.order2 without sensor.tau; state the filter's tau in s beside it")

@@ -89,7 +89,9 @@ def merge_captures(captures, bench, path):
         dt, index, _ = grid
         f = fundamental(np.interp(np.arange(index[-1] + 1), index, channels[drive]), dt)
         if f is None or (index[-1] + 1) * dt * f < 1.2:
-            raise RecordingError(f"{path}: the {drive} of capture {k} does not repeat; merge needs captures of two periods (columns.time.merge)")
+            raise RecordingError(
+                f"{path}: the {drive} of capture {k} does not repeat; merge needs captures of two periods (columns.time.merge)"
+            )
         grids.append((dt, index, channels))
         frequencies.append(f)
     f, per = float(np.median(frequencies)), int(round(1 / (float(np.median(frequencies)) * grids[0][0])))

@@ -57,7 +57,9 @@ def load_calibrations(paths, bench) -> list[Recording]:
             wanted = ("time", "reference", bench.output)
             columns = {q: _find(path, table, q, bench.columns.get(q, {}), required=True) for q in wanted}
             time, channels, _ = bridge_gaps(columns["time"] - columns["time"][0], {q: columns[q] for q in wanted[1:]}, "reference")
-            found.append(Recording(time, channels, {}, {**origin, "metadata": {k: _number(v) for k, v in metadata.items()}}, path.name))
+            found.append(
+                Recording(time, channels, {}, {**origin, "metadata": {k: _number(v) for k, v in metadata.items()}}, path.name)
+            )
     return found
 
 
@@ -189,7 +191,17 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
     columns, available = {}, list(table)
     quantities = {bench.drive, bench.output, *[q for q in bench.columns if q != "time"]}
-    for quantity in ("time", "voltage", "temperature", "magnetization", "flux_density", "displacement", "current", "command", "field"):
+    for quantity in (
+        "time",
+        "voltage",
+        "temperature",
+        "magnetization",
+        "flux_density",
+        "displacement",
+        "current",
+        "command",
+        "field",
+    ):
         column = bench.columns.get(quantity, {})
         found = _find(path, table, quantity, column, required=quantity in (bench.drive, bench.output))
         if found is not None:

@@ -25,7 +25,9 @@ class Recording:
 
     def __post_init__(self):
         if len(self.time) < 16:
-            raise RecordingError(f"{self.name}: only {len(self.time)} samples; record at least one whole period (16 samples or more)")
+            raise RecordingError(
+                f"{self.name}: only {len(self.time)} samples; record at least one whole period (16 samples or more)"
+            )
         for channel, values in self.channels.items():
             if len(values) != len(self.time):
                 raise RecordingError(f"{self.name}: channel {channel} has {len(values)} samples, time has {len(self.time)}")
@@ -42,11 +44,15 @@ class Recording:
 
     def _check_time(self):
         if not np.all(np.isfinite(self.time)):
-            raise RecordingError(f"{self.name}: time is not a number at sample {int(np.argmin(np.isfinite(self.time)))}; rewrite the time column")
+            raise RecordingError(
+                f"{self.name}: time is not a number at sample {int(np.argmin(np.isfinite(self.time)))}; rewrite the time column"
+            )
         steps = np.diff(self.time)
         dt = np.median(steps)
         if not dt > 0:
-            raise RecordingError(f"{self.name}: time does not increase at sample {int(np.argmin(steps)) + 1}; sort the rows or mend the clock")
+            raise RecordingError(
+                f"{self.name}: time does not increase at sample {int(np.argmin(steps)) + 1}; sort the rows or mend the clock"
+            )
         worst = int(np.argmax(np.abs(steps - dt)))
         if abs(steps[worst] - dt) > 0.3 * dt:
             raise RecordingError(
@@ -66,7 +72,9 @@ class Recording:
 
     def frequency(self) -> float | None:
         """Fundamental of the drive, Hz; None where less than 0.9 of a period is recorded or nothing repeats."""
-        return fundamental(np.asarray(self.channels[self.drive], float), self.dt, self.origin.get("metadata", {}).get("frequency_Hz"))
+        return fundamental(
+            np.asarray(self.channels[self.drive], float), self.dt, self.origin.get("metadata", {}).get("frequency_Hz")
+        )
 
     def periods(self) -> float:
         """How many periods were recorded (0 where aperiodic)."""

@@ -94,7 +94,9 @@ def finish_chain(actuator, line, command, current, H, M, v, residual, overflow) 
             displacement = effect.displacement(displacement, free, signals, line, actuator)
     quantity = {"displacement": displacement, **signals}[actuator.output]
     if quantity is None:
-        raise ConfigurationError(f"the bench reads {actuator.output} but has no magnetostriction; add the block or read flux_density")
+        raise ConfigurationError(
+            f"the bench reads {actuator.output} but has no magnetostriction; add the block or read flux_density"
+        )
     reading = actuator.sensor(quantity)
     for effect in actuator.effects:
         reading = effect.reading(reading, {**signals, "displacement": displacement}, line, actuator)

@@ -38,7 +38,9 @@ class Drive:
     def within(self, limit: float) -> "Drive":
         """This drive; raises `ConfigurationError` where it passes `limit` (A)."""
         if self.peak > limit * (1 + 1e-12):
-            raise ConfigurationError(f"drive {self.name} reaches {self.peak:.4g} where the limit is {limit:.4g}; lower its amplitude or offset")
+            raise ConfigurationError(
+                f"drive {self.name} reaches {self.peak:.4g} where the limit is {limit:.4g}; lower its amplitude or offset"
+            )
         return self
 
 
@@ -64,7 +66,12 @@ def sine(frequency, amplitude, offset=0.0, *, periods: int = 4, samples: int = 1
     _counts(periods=periods, samples=samples)
     phase = 2 * np.pi * np.arange(samples) / samples
     one = offset + amplitude * np.sin(phase)
-    return Drive(np.tile(one, periods), 1 / (frequency * samples), float(frequency), f"sine {frequency:g} Hz, {amplitude:g} A about {offset:g} A")
+    return Drive(
+        np.tile(one, periods),
+        1 / (frequency * samples),
+        float(frequency),
+        f"sine {frequency:g} Hz, {amplitude:g} A about {offset:g} A",
+    )
 
 
 def sweep_set(frequencies, amplitudes, offsets=(0.0,), *, limit=None, periods: int = 4, samples: int = 1000) -> list[Drive]:
@@ -139,7 +146,9 @@ def _common_base(frequencies) -> float:
         ratios = frequencies / (scale / divisor)
         if np.all(np.abs(ratios - np.round(ratios)) < 1e-6 * ratios):
             return float(scale / divisor)
-    raise ConfigurationError(f"frequencies {', '.join(f'{f:g}' for f in frequencies)} Hz have no common base; choose multiples of one frequency")
+    raise ConfigurationError(
+        f"frequencies {', '.join(f'{f:g}' for f in frequencies)} Hz have no common base; choose multiples of one frequency"
+    )
 
 
 def modulated_sine(carrier, modulation, amplitude, depth=0.6, offset=0.0, *, periods: int = 4, samples: int = 2000) -> Drive:
@@ -151,11 +160,15 @@ def modulated_sine(carrier, modulation, amplitude, depth=0.6, offset=0.0, *, per
     _counts(periods=periods, samples=samples)
     ratio = carrier / modulation
     if abs(ratio - round(ratio)) > 1e-6 * ratio or round(ratio) < 2:
-        raise ConfigurationError(f"carrier = {carrier:g} Hz must be a whole multiple, two or more, of modulation = {modulation:g} Hz")
+        raise ConfigurationError(
+            f"carrier = {carrier:g} Hz must be a whole multiple, two or more, of modulation = {modulation:g} Hz"
+        )
     if not 0 <= depth <= 1:
         raise ConfigurationError(f"depth = {depth!r} must lie between 0 and 1")
     if round(ratio) > samples / 8:
-        raise ConfigurationError(f"{samples} samples a period are too few for the carrier; give samples = {8 * round(ratio)} or more")
+        raise ConfigurationError(
+            f"{samples} samples a period are too few for the carrier; give samples = {8 * round(ratio)} or more"
+        )
     t = np.arange(samples) / samples
     one = offset + amplitude * (1 + depth * np.cos(2 * np.pi * t)) / (1 + depth) * np.sin(2 * np.pi * round(ratio) * t)
     name = f"{carrier:g} Hz modulated at {modulation:g} Hz, {amplitude:g} A about {offset:g} A"

@@ -46,4 +46,6 @@ for effect in found.effects:
     for name, (before, after) in effect["shifts"].items():
         print(f"   {name:14s} {before:9.4g} -> {after:9.4g}")
 for row in found.check:
-    print(f"{row['file']}: {row['rms_before'] * 1e9:.0f} nm before, {row['rms_after'] * 1e9:.0f} nm after, noise {row['noise_rms'] * 1e9:.0f} nm")
+    print(
+        f"{row['file']}: {row['rms_before'] * 1e9:.0f} nm before, {row['rms_after'] * 1e9:.0f} nm after, noise {row['noise_rms'] * 1e9:.0f} nm"
+    )

@@ -46,5 +46,7 @@ for k, strategy in enumerate(("proportional", "static_inverse", "dynamic_inverse
 
 # %%
 bound = backward_bound(plant, 5e-4)
-print(f"Prop. 4.3: {bound.share:.2f} of the saturation, simulated worst {simulated_worst(plant, 5e-4, bound.g_bar, trials=4, length=60) / plant.operator.total:.2f}")
+print(
+    f"Prop. 4.3: {bound.share:.2f} of the saturation, simulated worst {simulated_worst(plant, 5e-4, bound.g_bar, trials=4, length=60) / plant.operator.total:.2f}"
+)
 print(bound.note)

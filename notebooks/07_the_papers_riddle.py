@@ -153,5 +153,10 @@ if not QUICK:
             e = result.estimate(name)
             ax.errorbar([k], [e.value], [2 * e.stderr], fmt="s" if k == 0 else "o", capsize=4)
         ax.axhline(value, color="0.7")
-        ax.set(title=f"{name}, {e.unit}" if e.unit != "1" else name, xticks=[0, 1], xticklabels=["plain", "with instruments"], xlim=(-0.5, 1.5))
+        ax.set(
+            title=f"{name}, {e.unit}" if e.unit != "1" else name,
+            xticks=[0, 1],
+            xticklabels=["plain", "with instruments"],
+            xlim=(-0.5, 1.5),
+        )
         ax.set_ylim(0, None)

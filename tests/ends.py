@@ -31,7 +31,9 @@ def interpreter(version: str) -> str | None:
     """An interpreter of that version on this machine: on the path or among pyenv's; None where there is none."""
     places = [shutil.which(f"python{version}"), *sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))]
     for place in filter(None, places):
-        asked = subprocess.run([str(place), "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], capture_output=True, text=True)
+        asked = subprocess.run(
+            [str(place), "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], capture_output=True, text=True
+        )
         if asked.stdout.strip() == version:
             return str(place)
     return None
@@ -50,7 +52,11 @@ def environment(where: Path, version: str, resolution: str) -> str | None:
     if made.returncode:
         return f"uv venv: {made.stderr.strip().splitlines()[-1]}"
     done = subprocess.run([uv, "pip", "install", "-q", "--resolution", resolution, "-e", f"{ROOT}[test]"], **quiet)
-    return None if done.returncode == 0 else f"cannot be installed: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'uv failed'}"
+    return (
+        None
+        if done.returncode == 0
+        else f"cannot be installed: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'uv failed'}"
+    )
 
 
 def versions(where: Path) -> str:
@@ -65,7 +71,9 @@ def versions(where: Path) -> str:
 def smoke(where: Path, tests) -> int:
     """Run tests in an environment; pytest's exit status."""
     settings = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "MAGJAX_CACHE": str(where / "cache")}
-    return subprocess.run([str(where / "bin" / "python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests], cwd=ROOT, env=settings).returncode
+    return subprocess.run(
+        [str(where / "bin" / "python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests], cwd=ROOT, env=settings
+    ).returncode
 
 
 def attempt(name: str, place: Path, tests) -> int:

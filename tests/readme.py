@@ -50,13 +50,22 @@ def environment() -> dict:
     """What a command of the tour runs under: this checkout, the tests' cache."""
     from tests.conftest import cache
 
-    return {**os.environ, "PYTHONPATH": str(ROOT), "MAGJAX_CACHE": str(cache), "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg", "COLUMNS": "200"}
+    return {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "MAGJAX_CACHE": str(cache),
+        "OPENBLAS_NUM_THREADS": "1",
+        "MPLBACKEND": "Agg",
+        "COLUMNS": "200",
+    }
 
 
 def run(command: str, folder: Path) -> str:
     """Type a command in a folder; what came back, errors among it. Raises `AssertionError` where it fails."""
     line = f'magjax() {{ {shlex.quote(sys.executable)} -m magjax "$@"; }}; {command}'
-    done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    done = subprocess.run(
+        ["bash", "-c", line], cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert done.returncode == 0, f"$ {command}\n{done.stdout[-3000:]}"
     return done.stdout
 

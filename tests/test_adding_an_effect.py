@@ -62,7 +62,7 @@ def test_the_shared_table_takes_it(kind):
 def test_the_page_names_every_hook_and_its_own_lines():
     hooks = ("drive", "field_shift", "magnetization", "strain", "displacement", "reading")
     assert all(callable(getattr(AbstractEffect, hook)) and f"`{hook}(" in PAGE for hook in hooks)
-    assert f"from .{PLACE} import " in PAGE and f"-k \"{PLACE} or catalogue\"" in PAGE
+    assert f"from .{PLACE} import " in PAGE and f'-k "{PLACE} or catalogue"' in PAGE
 
 
 @pytest.mark.long

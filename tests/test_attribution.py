@@ -26,7 +26,15 @@ def trial(name, chi2n, parameters=1, base=3.0, physical=True, direction=(1.0, 0.
     """A fit that ended at chi2/N."""
     drop = (base - chi2n) * COUNT
     result = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, converged=True)
-    return Trial(candidate(name, 20.0, direction), result, drop, parameters * np.log(COUNT) - drop, physical, drop / ((base - 0.92) * COUNT), parameters)
+    return Trial(
+        candidate(name, 20.0, direction),
+        result,
+        drop,
+        parameters * np.log(COUNT) - drop,
+        physical,
+        drop / ((base - 0.92) * COUNT),
+        parameters,
+    )
 
 
 def names(found):
@@ -108,7 +116,9 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
 
 
 @pytest.mark.parametrize(
-    ("chi2n", "z", "rough"), [(1.8, 6.5, True), (1.8, 9.0, False), (4.0, 6.5, False)], ids=["a rough density", "something scores", "too much is left"]
+    ("chi2n", "z", "rough"),
+    [(1.8, 6.5, True), (1.8, 9.0, False), (4.0, 6.5, False)],
+    ids=["a rough density", "something scores", "too much is left"],
 )
 def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
     from fitting.diagnose import _rough
@@ -127,7 +137,12 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
 
     plain = SimpleNamespace(chi2_per_sample=1.8, data_count=COUNT)
     current = SimpleNamespace(chi2_per_sample=1.4, data_count=COUNT, choices=Choices(knots=knots))
-    evidence = SimpleNamespace(reached=Reached(current, [(trial("creep", 1.4), [], [], plain)], {}), plain=plain, candidates=(candidate("creep", 12.0),), excess=1.4)
+    evidence = SimpleNamespace(
+        reached=Reached(current, [(trial("creep", 1.4), [], [], plain)], {}),
+        plain=plain,
+        candidates=(candidate("creep", 12.0),),
+        excess=1.4,
+    )
     large = (2e-6, 4e-7, 4e-7)[: len(after)] if len(after) > 1 else (2e-7,)
     rows = [{"rms_before": b, "rms_after": a, "noise_rms": 5e-8} for b, a in zip(large, after, strict=True)]
     assert _rough(evidence, rows) == rough
@@ -148,14 +163,22 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
 
 @pytest.mark.parametrize(
     ("chi2n", "after", "word"),
-    [(1.0, (1.05, 1.1), "attributed"), (1.0, (1.3, 4.0), "unknown_at"), (1.4, (1.05, 1.1), "attributed"), (2.0, (1.05, 1.1), "unknown_at")],
+    [
+        (1.0, (1.05, 1.1), "attributed"),
+        (1.0, (1.3, 4.0), "unknown_at"),
+        (1.4, (1.05, 1.1), "attributed"),
+        (2.0, (1.05, 1.1), "unknown_at"),
+    ],
     ids=["foretells", "foretells worse", "a little left", "much left"],
 )
 def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, chi2n, after, word):
     """One of two check recordings may get better and the other far worse: together they are worse."""
     import fitting.verdict as module
 
-    rows = [{"file": "c", "unit": "m", "rms_before": b * 4e-8, "rms_after": a * 4e-8, "noise_rms": 4e-8} for b, a in zip((1.4, 2.0), after, strict=True)]
+    rows = [
+        {"file": "c", "unit": "m", "rms_before": b * 4e-8, "rms_after": a * 4e-8, "noise_rms": 4e-8}
+        for b, a in zip((1.4, 2.0), after, strict=True)
+    ]
     monkeypatch.setattr(module, "check_errors", lambda *a: rows)
     monkeypatch.setattr(module, "exchange", lambda *a: None)
     monkeypatch.setattr(module, "_found", lambda e: ([{"name": "creep", "block": "mechanics"}], [], {}, []))
@@ -163,5 +186,7 @@ def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, 
     current = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=None)
     reached = Reached(current, [(trial("creep", chi2n, base=220.0), [], [], plain)], {})
     where = {"by_block": {"mechanics": 1.0}, "by_field": []}
-    evidence = module.Evidence(reached, (), plain, plain, (), (), SimpleNamespace(drive="current"), (["check"], ["check"]), {}, where, ())
+    evidence = module.Evidence(
+        reached, (), plain, plain, (), (), SimpleNamespace(drive="current"), (["check"], ["check"]), {}, where, ()
+    )
     assert module.verdict(evidence).verdict == word

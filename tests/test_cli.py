@@ -30,12 +30,26 @@ def test_fit_writes_what_the_interface_promises(folder, capsys):
     assert main(["fit", *files, "--bench", "aa-050h", "--out", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     content = json.loads((out / "fit.json").read_text())
-    for key in ("converged", "message", "bench", "recordings", "parameters", "levels", "chi2_per_sample", "bic", "jacobians", "compile_s", "solve_s"):
+    for key in (
+        "converged",
+        "message",
+        "bench",
+        "recordings",
+        "parameters",
+        "levels",
+        "chi2_per_sample",
+        "bic",
+        "jacobians",
+        "compile_s",
+        "solve_s",
+    ):
         assert key in content and key in printed
     assert set(content["parameters"]["coil.R_eddy"]) >= {"value", "stderr", "unit", "free", "at_bound", "identified"}
     assert content["recordings"][0]["sha256"] and content["chi2_per_sample"] < 1.25
     page = (out / "report.html").read_text()
-    assert page.count("<svg") >= 3 and "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")
+    assert page.count("<svg") >= 3 and "http://" not in page.replace("http://www.w3.org", "").replace(
+        "http://purl.org", ""
+    ).replace("http://creativecommons.org", "")
     assert len(page) < 1_500_000 and 'aria-label="' in page
     # the model simulates again, bit for bit
     actuator, bench = load_model(out)
@@ -43,7 +57,10 @@ def test_fit_writes_what_the_interface_promises(folder, capsys):
     drive = 0.1 + 0.5 * np.sin(2 * np.pi * np.arange(200) / 200)
     a, b = (np.asarray(simulate(x, drive, 1e-4, periodic=True).reading) for x in (actuator, again))
     assert np.array_equal(a, b) and bench.name == "aa-050h"
-    assert main(["simulate", "--model", str(out), "--frequency", "50", "--amplitude", "0.5", "--out", str(folder / "s.nc"), "--quiet"]) == 0
+    assert (
+        main(["simulate", "--model", str(out), "--frequency", "50", "--amplitude", "0.5", "--out", str(folder / "s.nc"), "--quiet"])
+        == 0
+    )
     assert main(["report", str(out)]) == 0
 
 
@@ -115,7 +132,13 @@ def test_bad_recordings_say_the_mend_in_one_line(tmp_path, capsys, kind, words):
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("[coil]\nR_edy = 3\n", "R_eddy"), ("[coil]\nR_eddy = -3\n", "negative"), ("[coil\n", "TOML"), ("[hysteresis]\nlevels = 'x'\n", "levels"), ("[fit]\nfree = ['coil.Reddy']\n", "R_eddy")],
+    [
+        ("[coil]\nR_edy = 3\n", "R_eddy"),
+        ("[coil]\nR_eddy = -3\n", "negative"),
+        ("[coil\n", "TOML"),
+        ("[hysteresis]\nlevels = 'x'\n", "levels"),
+        ("[fit]\nfree = ['coil.Reddy']\n", "R_eddy"),
+    ],
 )
 def test_bad_bench_files_say_the_mend(tmp_path, capsys, text, words):
     (tmp_path / "bench.toml").write_text(text)

@@ -11,7 +11,17 @@ from fitting.diagnose import diagnose
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 
-DRIVES = ((10, 0.8, 0.1), (20, 0.5, -0.2), (50, 0.8, 0.1), (80, 0.5, -0.2), (120, 0.8, 0.1), (160, 0.5, -0.2), (200, 0.8, 0.1), (250, 0.5, -0.2), (300, 0.8, 0.1))
+DRIVES = (
+    (10, 0.8, 0.1),
+    (20, 0.5, -0.2),
+    (50, 0.8, 0.1),
+    (80, 0.5, -0.2),
+    (120, 0.8, 0.1),
+    (160, 0.5, -0.2),
+    (200, 0.8, 0.1),
+    (250, 0.5, -0.2),
+    (300, 0.8, 0.1),
+)
 CLASSES = {c.name: c for c in CATALOGUE}
 CASES = [
     ("excess_loss", {"k": 30.0, "rate_knee": 5.0}, False),
@@ -39,7 +49,9 @@ def test_concealed_effect_is_named(name, parameters, rough):
     bench = load_bench("aa-050h")
     rng = np.random.default_rng(11)
     truth = concealed_actuator(bench, CLASSES[name](**parameters), rough)
-    found = diagnose([record(truth, *d, rng, f"r{d[0]}") for d in DRIVES], bench, check=[record(truth, 400, 0.6, 0.05, rng, "check")])
+    found = diagnose(
+        [record(truth, *d, rng, f"r{d[0]}") for d in DRIVES], bench, check=[record(truth, 400, 0.6, 0.05, rng, "check")]
+    )
     print(f"\n{name} ({'rough' if rough else 'smooth'}): {found}")
     named = {e["name"] for e in found.effects} | {n for g in found.groups for n in g}
     assert name in named

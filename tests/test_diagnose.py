@@ -47,7 +47,14 @@ def test_silent_where_nothing_is_missing(bench):
 
 def test_names_a_concealed_sensor_filter(bench):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
-    asked = {"sensor_lag", "amplifier_lag", "transport_delay", "second_mode", "duffing_stiffness", "excess_loss"}  # all of it: the blind suites
+    asked = {
+        "sensor_lag",
+        "amplifier_lag",
+        "transport_delay",
+        "second_mode",
+        "duffing_stiffness",
+        "excess_loss",
+    }  # all of it: the blind suites
     others = tuple(e.name for e in CATALOGUE if e.name not in asked)
     found = diagnose(runs, bench, check=checks, choices=Choices(fine=250, without=others))
     assert found.verdict == "attributed"
@@ -123,7 +130,9 @@ def test_periods_that_do_not_divide_are_no_data_problem():
 
 def test_a_swapped_sign_is_a_data_problem(bench):
     runs, _ = study(bench)
-    swapped = [Recording(r.time, {**r.channels, "displacement": 6e-5 - r.channels["displacement"]}, {}, r.origin, r.name) for r in runs]
+    swapped = [
+        Recording(r.time, {**r.channels, "displacement": 6e-5 - r.channels["displacement"]}, {}, r.origin, r.name) for r in runs
+    ]
     found = diagnose(swapped, bench, choices=Choices(fine=250, max_jacobians=8))
     assert found.verdict == "data_problem" and "sign" in found.message
 
@@ -157,7 +166,9 @@ def test_periods_that_do_not_repeat_are_a_data_problem():
 def test_a_sensors_zero_is_adopted_where_it_scores_best_and_told_of_where_an_effect_does_as_well(bench, monkeypatch):
     rng = np.random.default_rng(3)
     truth, zero = concealed_actuator(bench), 6e-6
-    runs = [record(truth, *drive, rng, f"r{drive[0]}") for drive in ((10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0))]
+    runs = [
+        record(truth, *drive, rng, f"r{drive[0]}") for drive in ((10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0))
+    ]
     runs = [dataclasses.replace(r, channels={**r.channels, "displacement": r.channels["displacement"] + zero}) for r in runs]
     base = module.fit(runs, bench, refine=False)
     monkeypatch.setattr(module, "screened", lambda result, choices: [])

@@ -51,7 +51,9 @@ def test_drifts_of_the_same_size_in_long_and_short_records_are_each_their_own(sh
     for clean, bare, drifted in zip(remove_record_effect(runs, best, "displacement"), plain, runs, strict=True):
         left, there = (np.std(x.channels["displacement"] - bare.channels["displacement"]) for x in (clean, drifted))
         assert left < 0.25 * there
-    assert all(s.drift == pytest.approx(size, rel=0.25) for s in spectra_of(remove_record_effect(runs, best, "displacement"), BENCH))
+    assert all(
+        s.drift == pytest.approx(size, rel=0.25) for s in spectra_of(remove_record_effect(runs, best, "displacement"), BENCH)
+    )
 
 
 def test_hum_beside_the_drift_does_not_pass_for_it():
@@ -62,7 +64,10 @@ def test_hum_beside_the_drift_does_not_pass_for_it():
 
 def test_a_strong_drift_of_a_short_record_is_no_data_problem():
     """Periods that differ by what one straight drift and its root explain repeat; a decaying swing does not."""
-    for beside, wrong in ((lambda t: 1.2e-6 * np.sqrt(t / t[-1]), False), (lambda t: 2e-6 * np.exp(-t / t[-1] * 2.7) * np.cos(9.3 * t / t[-1]), True)):
+    for beside, wrong in (
+        (lambda t: 1.2e-6 * np.sqrt(t / t[-1]), False),
+        (lambda t: 2e-6 * np.exp(-t / t[-1] * 2.7) * np.cos(9.3 * t / t[-1]), True),
+    ):
         runs = records(beside)
         found = data_problem(runs, spectra_of(runs, BENCH), "displacement")
         assert (found is not None) is wrong
@@ -79,7 +84,11 @@ def test_check_recordings_lose_what_was_adopted_and_no_more():
     assert np.abs(left).max() < 0.15 * size
     (same,) = remove_from_checks([check], [], BENCH)
     assert np.array_equal(same.channels["displacement"], check.channels["displacement"])
-    aperiodic = Recording(check.time, {"current": np.linspace(0, 1, len(check.time)) ** 2, "displacement": check.channels["displacement"]}, name="ramp")
+    aperiodic = Recording(
+        check.time,
+        {"current": np.linspace(0, 1, len(check.time)) ** 2, "displacement": check.channels["displacement"]},
+        name="ramp",
+    )
     assert remove_from_checks([aperiodic], [drift], BENCH) == [aperiodic]
 
 
@@ -88,5 +97,8 @@ def test_check_recordings_lose_heat_at_the_amplitude_that_the_others_show():
     heat = next(e for e in scored(runs) if e.name == "thermal_drift")
     (check,) = records(lambda t: 8e-6 * 0.32 * 0.3 * (1 - np.exp(-t / 0.3)), (7.0,), seed=9)
     (bare,) = records(frequencies=(7.0,), seed=9)
-    before, after = (np.std(x.channels["displacement"] - bare.channels["displacement"]) for x in (check, *remove_from_checks([check], [heat], BENCH)))
+    before, after = (
+        np.std(x.channels["displacement"] - bare.channels["displacement"])
+        for x in (check, *remove_from_checks([check], [heat], BENCH))
+    )
     assert after < 0.2 * before

@@ -24,7 +24,9 @@ def reading(act, current=CURRENT):
 
 
 def test_every_effect_is_in_the_catalogue():
-    defined = {v for v in vars(effects).values() if isinstance(v, type) and issubclass(v, AbstractEffect) and v is not AbstractEffect}
+    defined = {
+        v for v in vars(effects).values() if isinstance(v, type) and issubclass(v, AbstractEffect) and v is not AbstractEffect
+    }
     assert defined == set(CATALOGUE)
     assert len({k.name for k in CATALOGUE}) == len(CATALOGUE) >= 29
 
@@ -59,7 +61,9 @@ def test_null_gradient_and_batch(kind):
     assert np.abs(number).max() > 0
     assert np.abs(exact - number).max() < 2e-4 * np.abs(number).max()
     both = jax.vmap(lambda c: reading(extended.replace({name: value}), c))(jnp.stack([CURRENT, 0.5 * CURRENT]))
-    assert np.asarray(both[1]) == pytest.approx(np.asarray(reading(extended.replace({name: value}), 0.5 * CURRENT)), abs=1e-16, rel=1e-9)
+    assert np.asarray(both[1]) == pytest.approx(
+        np.asarray(reading(extended.replace({name: value}), 0.5 * CURRENT)), abs=1e-16, rel=1e-9
+    )
 
 
 def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():
@@ -109,7 +113,9 @@ def test_smooth_friction_approaches_coulomb():
     from magjax.effects import CoulombFriction
 
     act = actuator(20)
-    with_friction = [np.asarray(reading(act.with_effect(CoulombFriction(f=2e-7, v_s=v, presliding=1e-9)))) for v in (1e-3, 1e-4, 1e-5)]
+    with_friction = [
+        np.asarray(reading(act.with_effect(CoulombFriction(f=2e-7, v_s=v, presliding=1e-9)))) for v in (1e-3, 1e-4, 1e-5)
+    ]
     assert np.abs(with_friction[2] - with_friction[1]).mean() < 0.3 * np.abs(with_friction[1] - with_friction[0]).mean()
 
 
@@ -134,7 +140,9 @@ def test_a_second_path_round_the_coil_filters_the_drive():
     kappa, tau = 0.05, 2e-3
     line = Timeline(jnp.asarray(DT), N, True)
     act = actuator(20)
-    inside = np.asarray(run_chain(act.with_effect(effects.SecondEddyPath(kappa=kappa, tau=tau, air=1.0)), CURRENT, DT, 4, 4, "bdf2").reading)
+    inside = np.asarray(
+        run_chain(act.with_effect(effects.SecondEddyPath(kappa=kappa, tau=tau, air=1.0)), CURRENT, DT, 4, 4, "bdf2").reading
+    )
     filtered = CURRENT - line.filter(CURRENT, lambda s: kappa * tau * s / (1 + tau * s))
     outside = np.asarray(run_chain(act, filtered, DT, 4, 4, "bdf2").reading)
     without = np.asarray(run_chain(act, CURRENT, DT, 4, 4, "bdf2").reading)

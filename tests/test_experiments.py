@@ -31,7 +31,9 @@ def test_instruments_are_asked_for_by_themselves():
     assert channels_for(("mechanics", "magnetostriction")) == []
     assert "pick-up" in channels_for(("coil", "hysteresis"))[0] and "range" in channels_for(("sensor", "magnetostriction"))[0]
     asked = instrument_request(("source", "sensor"))
-    assert asked["drive"] is None and "shunt" in asked["text"] and "calibration" in asked["text"] and "a mass added" in asked["text"]
+    assert (
+        asked["drive"] is None and "shunt" in asked["text"] and "calibration" in asked["text"] and "a mass added" in asked["text"]
+    )
 
 
 def test_the_menu_stays_within_what_was_visited():
@@ -46,7 +48,10 @@ def known(r, J=None, C=None):
 
 
 def test_what_a_fit_could_take_up_separates_nothing(monkeypatch):
-    made = {"a": known([[0.0, 0.0], [0.0, 0.0]]), "b": known([[30.0, 0.0], [0.0, 5.0]], np.array([[[1.0], [0.0]]] * 2), np.array([[1e6]]))}
+    made = {
+        "a": known([[0.0, 0.0], [0.0, 0.0]]),
+        "b": known([[30.0, 0.0], [0.0, 5.0]], np.array([[[1.0], [0.0]]] * 2), np.array([[1e6]])),
+    }
     monkeypatch.setattr(experiments, "_predicted", lambda result, drives, spectra: made[result])
     rivals = [SimpleNamespace(result="a"), SimpleNamespace(result="b")]
     apart = separations(rivals, [(10, 1, 0), (20, 1, 0)], SPECTRA)
@@ -63,6 +68,9 @@ def test_a_sine_is_proposed_only_where_it_decides(monkeypatch, gap, sine):
     assert found["channels"] == [CALIBRATION] and found["text"].startswith("record a calibration")
     assert (found["drive"] is not None) == sine and bool(found["separates"]) == sine
     if sine:
-        assert found["drive"]["frequency_Hz"] == pytest.approx(drives[3][0]) and found["separates"][0][:2] == ["sensor_lag", "delta_e"]
+        assert found["drive"]["frequency_Hz"] == pytest.approx(drives[3][0]) and found["separates"][0][:2] == [
+            "sensor_lag",
+            "delta_e",
+        ]
     else:
         assert "no sine within the limits" in found["text"]

@@ -34,7 +34,9 @@ def bench():
 def recordings(bench):
     rng = np.random.default_rng(7)
     truth = concealed_actuator(bench)
-    return [record(truth, *drive, rng, f"r{drive[0]}") for drive in ((10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0))]
+    return [
+        record(truth, *drive, rng, f"r{drive[0]}") for drive in ((10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +161,9 @@ def test_noise_is_found_between_the_harmonics():
         t = np.arange(n) / (1000 * f)
         drive = np.sin(2 * np.pi * f * t)
         y = 1e-5 * drive**3 + 30e-9 * rng.standard_normal(n)
-        spectra.append(reduce_recording(Recording(t, {"current": drive, "displacement": y}, name=str(f)), "current", "displacement"))
+        spectra.append(
+            reduce_recording(Recording(t, {"current": drive, "displacement": y}, name=str(f)), "current", "displacement")
+        )
     assert estimate_noise(spectra).rms == pytest.approx(30e-9, rel=0.05)
 
 
@@ -171,7 +175,9 @@ def test_noise_is_each_recordings_own_where_it_differs_and_pooled_where_not(leve
         t = np.arange(500) / (500 * (k + 1))
         drive = np.sin(2 * np.pi * (k + 1) * t)
         y = 1e-5 * drive**3 + levels[k % 2] * rng.standard_normal(500)
-        spectra.append(reduce_recording(Recording(t, {"current": drive, "displacement": y}, name=str(k)), "current", "displacement"))
+        spectra.append(
+            reduce_recording(Recording(t, {"current": drive, "displacement": y}, name=str(k)), "current", "displacement")
+        )
     found = [s.noise.rms for s in with_noise(spectra)]
     if levels[1] > 1.5 * levels[0]:
         assert np.allclose(found, np.tile(levels, 3), rtol=0.2)
@@ -212,7 +218,9 @@ def test_lambda_s_freed_with_a_prior_comes_back_and_the_valley_is_told(recording
     """Stroke and mass scale make up for each other, and R_eddy with them: the errors are as wide as the prior lets them."""
     name, true = "magnetostriction.lambda_s", 1.313e-3
     stated = dataclasses.replace(bench, priors={name: 0.02 * true})
-    got = fit(recordings, stated, actuator=bench.actuator().replace({name: 0.98 * true}), extra=(name,), choices=QUICK, refine=False)
+    got = fit(
+        recordings, stated, actuator=bench.actuator().replace({name: 0.98 * true}), extra=(name,), choices=QUICK, refine=False
+    )
     stroke, resistance = got.estimate(name), got.estimate("coil.R_eddy")
     assert got.converged and got.chi2_per_sample < 1.1
     assert abs(stroke.value - true) < 3 * stroke.stderr < 0.1 * true

@@ -22,7 +22,9 @@ def recording(gain=1.0, frequency=10.0, seed=0, emf=False):
 
 def test_uncertain_scales_are_whitened_as_their_covariance_says():
     columns = {"flux_density": {"gain_accuracy": 0.03}}
-    spectra = with_noise([reduce_recording(recording(1.0, f, k), "field", "flux_density", 10, columns) for k, f in enumerate((10.0, 20.0, 50.0))])
+    spectra = with_noise(
+        [reduce_recording(recording(1.0, f, k), "field", "flux_density", 10, columns) for k, f in enumerate((10.0, 20.0, 50.0))]
+    )
     deviations = np.stack([line_deviations(s, s.noise) for s in spectra])
     deviations[:, 0] = np.inf
     rows, share = gain_rows(spectra, deviations)
@@ -54,7 +56,9 @@ def test_bits_widen_the_low_orders_and_drop_the_converters_own_lines():
     assert np.count_nonzero(np.abs(reduce_recording(dirty, "field", "flux_density", 30, columns).drive) > 0) == 2
 
 
-@pytest.mark.parametrize(("line", "words"), [("bits = 0", "bits = 0"), ("gain_accuracy = 3", "gain_accuracy = 3"), ('bits = "8"', "bits = '8'")])
+@pytest.mark.parametrize(
+    ("line", "words"), [("bits = 0", "bits = 0"), ("gain_accuracy = 3", "gain_accuracy = 3"), ('bits = "8"', "bits = '8'")]
+)
 def test_wrong_instrument_keys_are_told(tmp_path, line, words):
     path = tmp_path / "b.toml"
     path.write_text(f"[coil]\nk_eddy = 0.1\n[columns.field]\n{line}\n")

@@ -71,11 +71,16 @@ def test_its_model_is_read_again_bit_for_bit(tmp_path):
     act = bench.actuator().with_effect(term_at("sensor")).replace({f"effects.learned_term.c{k}": 0.1 * k for k in range(12)})
     write_model(tmp_path, act, bench)
     again, _ = load_model(tmp_path)
-    assert np.array_equal(np.asarray(simulate(act, CURRENT, DT, periodic=True).reading), np.asarray(simulate(again, CURRENT, DT, periodic=True).reading))
+    assert np.array_equal(
+        np.asarray(simulate(act, CURRENT, DT, periodic=True).reading),
+        np.asarray(simulate(again, CURRENT, DT, periodic=True).reading),
+    )
 
 
 def test_the_function_stays_as_at_its_edge_beyond_the_range():
-    term = term_at("sensor").null("sensor", ("reading",), [0.0], [1.0], (5,), np.ones(5), 2.0, coefficients=[0.3, -1, 0.5, 0.2, 0.7])
+    term = term_at("sensor").null(
+        "sensor", ("reading",), [0.0], [1.0], (5,), np.ones(5), 2.0, coefficients=[0.3, -1, 0.5, 0.2, 0.7]
+    )
     assert float(term.value(jnp.asarray(1.4))) == float(term.value(jnp.asarray(1.0))) != float(term.value(jnp.asarray(0.9)))
     tilted = dataclasses.replace(term, beyond=jnp.asarray([0.0, 1.0]))
     assert float(tilted.value(jnp.asarray(1.4)) - term.value(jnp.asarray(1.4))) == pytest.approx(2.0 * 0.4)
@@ -151,7 +156,10 @@ def test_a_term_is_fitted_jointly_with_the_density():
 
     bench = load_bench("aa-050h")
     rng = np.random.default_rng(3)
-    runs = [record(concealed_actuator(bench, FieldKink()), *d, rng, f"r{d[0]}") for d in ((10, 0.8, 0.1), (80, 0.5, 0.1), (200, 0.8, 0.1))]
+    runs = [
+        record(concealed_actuator(bench, FieldKink()), *d, rng, f"r{d[0]}")
+        for d in ((10, 0.8, 0.1), (80, 0.5, 0.1), (200, 0.8, 0.1))
+    ]
     base = fit(runs, bench, choices=Choices(fine=250, max_jacobians=12, rest="negative"), refine=False)
     term = LearnedTerm.null("magnetostriction", ("field",), [1e3], [2.4e4], (16,), prior_deviations((16,), 0.2), 1e-7)
     learned = fit_term(base, Place("magnetostriction", ("field",), 100.0, 0.9, 0.2, 1e-7, 0.1, term), runs, bench)

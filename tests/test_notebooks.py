@@ -9,12 +9,20 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 LONG = ("02", "03", "06", "07")
-SOURCES = [pytest.param(p, marks=[pytest.mark.long] if p.name.startswith(LONG) else [], id=p.stem) for p in sorted(FOLDER.glob("0*.py"))]
+SOURCES = [
+    pytest.param(p, marks=[pytest.mark.long] if p.name.startswith(LONG) else [], id=p.stem) for p in sorted(FOLDER.glob("0*.py"))
+]
 
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_it_runs(source, tmp_path):
-    done = subprocess.run([sys.executable, str(source)], cwd=tmp_path, env={**os.environ, "MPLBACKEND": "Agg", "MAGJAX_QUICK": "1"}, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, str(source)],
+        cwd=tmp_path,
+        env={**os.environ, "MPLBACKEND": "Agg", "MAGJAX_QUICK": "1"},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
 
 

@@ -67,7 +67,9 @@ def test_a_pipe_and_quiet_see_nothing(capsys):
     with waiting.Waiting("magjax test") as shown:
         waiting.tell("doing something")
         assert shown._shown is None and sys.stdout is not None
-    done = subprocess.run([sys.executable, "-m", "magjax", "ports"], capture_output=True, text=True, env={**os.environ, "TERM": "xterm"})
+    done = subprocess.run(
+        [sys.executable, "-m", "magjax", "ports"], capture_output=True, text=True, env={**os.environ, "TERM": "xterm"}
+    )
     assert done.returncode == 0 and done.stderr == ""
 
 

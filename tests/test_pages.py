@@ -40,7 +40,10 @@ def test_every_parameter_and_every_bench_key_is_on_the_page():
         assert all(f"`{key}`" in text or f"`{block}.{key}`" in text for key in keys)
     for effect in CATALOGUE:
         assert all(f"`{effect.name}.{name}`" in text for name in effect.parameters())
-    assert set(parameters.SETTINGS) - {"sensor.tau", "sensor.order2"} == {"name", *(f"{section}.{key}" for section, keys in bench.OTHER_KEYS.items() for key in keys)}
+    assert set(parameters.SETTINGS) - {"sensor.tau", "sensor.order2"} == {
+        "name",
+        *(f"{section}.{key}" for section, keys in bench.OTHER_KEYS.items() for key in keys),
+    }
     assert set(parameters.COLUMNS) == set(bench.COLUMN_KEYS)
 
 
@@ -66,7 +69,12 @@ def test_every_command_and_every_argument_is_explained():
 
 def test_arguments_are_shown_as_typed():
     p = argparse.ArgumentParser()
-    given = [p.add_argument("files", nargs="+"), p.add_argument("--check", nargs="+"), p.add_argument("--kind", choices=("a", "b")), p.add_argument("--rate", type=float, default=0.0)]
+    given = [
+        p.add_argument("files", nargs="+"),
+        p.add_argument("--check", nargs="+"),
+        p.add_argument("--kind", choices=("a", "b")),
+        p.add_argument("--rate", type=float, default=0.0),
+    ]
     assert [commands.written(a) for a in given] == ["`FILES...`", "`--check CHECK...`", "`--kind a|b`", "`--rate RATE`"]
     assert commands.default(given[-1]) == "0" and commands.default(given[1]) == ""
 

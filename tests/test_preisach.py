@@ -112,7 +112,9 @@ def test_hard_relays_jump_and_converge_as_one_over_L():
 
 def test_start_states():
     def at(start, field=400.0, table=None):
-        return float(Preisach(smooth(20) if table is None else table, LOW, HIGH, start=start).magnetization(np.array([field]), corners=40)[0])
+        return float(
+            Preisach(smooth(20) if table is None else table, LOW, HIGH, start=start).magnetization(np.array([field]), corners=40)[0]
+        )
 
     low, high = at("negative_saturation"), at("positive_saturation")
     assert high > low + 0.5
@@ -176,7 +178,12 @@ def test_forc_masses_return_the_density():
 
 @pytest.mark.parametrize(
     ("arguments", "word"),
-    [((np.ones((3, 4)), 0, 1), "L x L"), ((-np.eye(3), 0, 1), "negative"), ((np.eye(3), 1, 0), "low < high"), ((np.eye(3), 0, 1, 0, "warm"), "start")],
+    [
+        ((np.ones((3, 4)), 0, 1), "L x L"),
+        ((-np.eye(3), 0, 1), "negative"),
+        ((np.eye(3), 1, 0), "low < high"),
+        ((np.eye(3), 0, 1, 0, "warm"), "start"),
+    ],
 )
 def test_bad_input_says_the_mend(arguments, word):
     with pytest.raises(ConfigurationError, match=word):

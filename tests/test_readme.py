@@ -23,7 +23,7 @@ def follow(folder, kinds):
             if block.kind == "file":
                 (folder / block.target).write_text(block.content)
             elif block.kind == "background":
-                (command, expected), = block.steps()
+                ((command, expected),) = block.steps()
                 process, line = readme.start(command, folder)
                 running.append(process)
                 wrong.append((command, readme.differs(expected, line, block)))

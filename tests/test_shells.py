@@ -34,7 +34,9 @@ def test_the_matrix_is_that_of_a_cylinder():
 @pytest.mark.parametrize(
     "extra",
     [
-        (), (effects.ExcessLoss(k=20.0),), (effects.MeanField(alpha=0.01), effects.MagneticAftereffect(share=0.1)),
+        (),
+        (effects.ExcessLoss(k=20.0),),
+        (effects.MeanField(alpha=0.01), effects.MagneticAftereffect(share=0.1)),
         (effects.SecondEddyPath(kappa=0.1, tau=1e-3, air=0.5), effects.RateDependentSwitching(gamma=20.0)),
     ],
     ids=lambda e: "+".join(x.name for x in e) or "alone",
@@ -82,7 +84,12 @@ def test_every_step_against_a_general_solver(scheme):
 
 def test_derivatives_of_the_constants_through_the_shells():
     act = actuator(20).with_effect(effects.FieldDiffusion(kappa=0.7)).with_effect(effects.MeanField(alpha=0.003))
-    for name, step in (("coil.R_eddy", 1e-3), ("effects.field_diffusion.kappa", 1e-5), ("effects.mean_field.alpha", 1e-7), ("coil.H_bias", 0.1)):
+    for name, step in (
+        ("coil.R_eddy", 1e-3),
+        ("effects.field_diffusion.kappa", 1e-5),
+        ("effects.mean_field.alpha", 1e-7),
+        ("coil.H_bias", 0.1),
+    ):
         value = float(act.parameters()[name][0])
 
         def reading(x, name=name):

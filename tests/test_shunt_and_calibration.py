@@ -30,7 +30,10 @@ def passed(law, frequency, drive, output, size, noise, seed=0, samples=400):
     rng = np.random.default_rng(seed + int(frequency))
     phase = 2 * np.pi * np.arange(4 * samples) / samples
     gain = law(2j * np.pi * frequency)
-    channels = {drive: size * np.sin(phase), output: size * np.imag(gain * np.exp(1j * phase)) + noise * rng.standard_normal(len(phase))}
+    channels = {
+        drive: size * np.sin(phase),
+        output: size * np.imag(gain * np.exp(1j * phase)) + noise * rng.standard_normal(len(phase)),
+    }
     return Recording(phase / (2 * np.pi * frequency), channels, {}, {}, f"{frequency} Hz")
 
 

@@ -57,7 +57,9 @@ def test_second_order(scheme):
     assert 1.7 < order < 2.8
 
 
-@pytest.mark.parametrize("name", ["coil.R_eddy", "coil.c0", "coil.H_bias", "mechanics.f0", "mechanics.xi", "magnetostriction.lambda_s", "sensor.offset"])
+@pytest.mark.parametrize(
+    "name", ["coil.R_eddy", "coil.c0", "coil.H_bias", "mechanics.f0", "mechanics.xi", "magnetostriction.lambda_s", "sensor.offset"]
+)
 def test_gradient_in_every_parameter(name):
     act = actuator()
     current = jnp.asarray(sine(120, 0.7))
@@ -115,7 +117,12 @@ def test_static_limit_without_eddy_currents():
 
 @pytest.mark.parametrize(
     ("drive", "dt", "word"),
-    [([0.0, np.nan] * 20, 1e-3, "NaN"), (np.ones((2, 2)), 1e-3, "one row"), (np.zeros(30), -1.0, "positive"), (5 * np.sin(np.arange(100) / 5), 1e-3, "outside")],
+    [
+        ([0.0, np.nan] * 20, 1e-3, "NaN"),
+        (np.ones((2, 2)), 1e-3, "one row"),
+        (np.zeros(30), -1.0, "positive"),
+        (5 * np.sin(np.arange(100) / 5), 1e-3, "outside"),
+    ],
 )
 def test_bad_drive_says_the_mend(drive, dt, word):
     with pytest.raises(ConfigurationError, match=word):
@@ -130,6 +137,8 @@ def test_sweep_equals_single_runs_and_does_not_depend_on_chunks():
     assert np.allclose(one.peak_to_peak, parts.peak_to_peak, rtol=1e-12)
     n = 250
     alone = simulate(act, 0.8 * np.sin(2 * np.pi * np.arange(n) / n), 1 / (120 * n), periodic=True, settle=2)
-    assert float(one.peak_to_peak.sel(frequency=120, amplitude=0.8).item()) == pytest.approx(float(np.ptp(np.asarray(alone.reading))), rel=1e-10)
+    assert float(one.peak_to_peak.sel(frequency=120, amplitude=0.8).item()) == pytest.approx(
+        float(np.ptp(np.asarray(alone.reading))), rel=1e-10
+    )
     assert float(one.loss.min()) > 0
     assert one.peak_to_peak.attrs["units"] == "m"

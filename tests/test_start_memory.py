@@ -53,7 +53,9 @@ def test_ends_of_rest_are_the_saturations():
     assert float(bottom.unreached(100.0, -100.0)) == 0.0
     field = jnp.asarray(np.tile(loop(300.0, 50.0), 2))
     positive = Preisach(masses_of(), LOW, HIGH, 0.0, "positive_saturation").magnetization(field)[-50:]
-    assert np.asarray(bottom.magnetization(field)[-50:] + top.unreached(field.max(), field.min())) == pytest.approx(np.asarray(positive), abs=1e-12)
+    assert np.asarray(bottom.magnetization(field)[-50:] + top.unreached(field.max(), field.min())) == pytest.approx(
+        np.asarray(positive), abs=1e-12
+    )
 
 
 def test_rows_of_the_fit_say_the_same():
@@ -90,7 +92,16 @@ def recordings_from(start, noise=40e-9, seed=0):
     actuator = dataclasses.replace(bench.actuator().replace({"coil.R_eddy": 62.0, "mechanics.xi": 0.8}), hysteresis=hysteresis)
     rng = np.random.default_rng(seed)
     made = []
-    for f, A, b in ((10, 0.8, 0.1), (20, 0.3, -0.4), (30, 0.6, 0.2), (50, 0.3, 0.4), (100, 0.8, 0.0), (150, 0.4, -0.3), (200, 0.5, 0.2), (300, 0.6, -0.1)):
+    for f, A, b in (
+        (10, 0.8, 0.1),
+        (20, 0.3, -0.4),
+        (30, 0.6, 0.2),
+        (50, 0.3, 0.4),
+        (100, 0.8, 0.0),
+        (150, 0.4, -0.3),
+        (200, 0.5, 0.2),
+        (300, 0.6, -0.1),
+    ):
         current = b + A * np.sin(2 * np.pi * np.arange(500) / 500)
         dt = 1 / (f * 500)
         reading = np.tile(np.asarray(run_chain(actuator, jnp.asarray(current), dt, 4, 4).reading), 4)

@@ -49,7 +49,9 @@ def test_public_things_are_documented(path):
 
 
 def test_the_command_line_starts_without_jax():
-    code = "import sys; from magjax.cli import main; main(['--help']); assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
+    code = (
+        "import sys; from magjax.cli import main; main(['--help']); assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 

@@ -27,7 +27,11 @@ def parts(unknown, sketch) -> list:
         "folder as learned_term. It models what is missing; it does not say what it is. Beyond the range seen it stays as at its edge, and its "
         "interval widens."
     )
-    return [part(text=text, table=tables.table("The learned function", ["question", "answer"], rows)), sketch(unknown["function"], learned_function, unknown), _boundaries(unknown)]
+    return [
+        part(text=text, table=tables.table("The learned function", ["question", "answer"], rows)),
+        sketch(unknown["function"], learned_function, unknown),
+        _boundaries(unknown),
+    ]
 
 
 def _with_unit(value, unit):
@@ -42,7 +46,16 @@ def _boundaries(unknown):
         place = (b["block"], tuple(b["variables"]))
         kept = place == (unknown["block"], tuple(unknown["variables"]))
         said = "kept" if kept else "not told from it" if place in rivals else ""
-        rows.append([b["block"], " and ".join(v.replace("_", " ") for v in b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"]), said])
+        rows.append(
+            [
+                b["block"],
+                " and ".join(v.replace("_", " ") for v in b["variables"]),
+                plain(b["evidence"]),
+                percent(b["share"]),
+                percent(b["visibility"]),
+                said,
+            ]
+        )
     note = (
         "To first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit is with a smooth function there than "
         "without. Visible: the part of it that density and constants cannot make."
@@ -61,20 +74,29 @@ def learned_function(unknown, stem: str = "learned"):
     seen = [factor * v for v in unknown["seen"][0]]
     second = unknown["variables"][1].replace("_", " ") if len(unknown["variables"]) > 1 else ""
     inside = (x >= unknown["seen"][0][0]) & (x <= unknown["seen"][0][1])
-    ends = [scale * f([f(np.asarray(s[k])[inside]) for s in unknown["function"]["slices"]]) for k, f in (("low", np.min), ("high", np.max))]
+    ends = [
+        scale * f([f(np.asarray(s[k])[inside]) for s in unknown["function"]["slices"]])
+        for k, f in (("low", np.min), ("high", np.max))
+    ]
     room = 0.6 * (ends[1] - ends[0])
     with styled():
         figure = canvas(10.0, 2.8)
         axes = figure.add_axes([0.085, 0.19, 0.86, 0.76])
-        for s, colour, dash in zip(unknown["function"]["slices"], (BLUE, VERMILION, GREEN), ("-", (0, (5, 2)), (0, (1, 1))), strict=False):
+        for s, colour, dash in zip(
+            unknown["function"]["slices"], (BLUE, VERMILION, GREEN), ("-", (0, (5, 2)), (0, (1, 1))), strict=False
+        ):
             name = "learned" if s["at"] is None else f"{second} {plain(s['at'])} {unit_text(unknown['variable_units'][1])}"
-            axes.fill_between(factor * x, scale * np.asarray(s["low"]), scale * np.asarray(s["high"]), color=colour, alpha=0.18, lw=0)
+            axes.fill_between(
+                factor * x, scale * np.asarray(s["low"]), scale * np.asarray(s["high"]), color=colour, alpha=0.18, lw=0
+            )
             axes.plot(factor * x, scale * np.asarray(s["value"]), color=colour, ls=dash, label=name)
         for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
             axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
         axes.axhline(0, color=MUTED, lw=0.5)
         axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room))
-        axes.set(xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}")
+        axes.set(
+            xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}"
+        )
         if len(unknown["function"]["slices"]) > 1:
             axes.legend(loc="best")
         caption = (

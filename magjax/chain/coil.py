@@ -36,7 +36,9 @@ class Coil(eqx.Module):
 class FieldCoil(eqx.Module):
     """A coil whose applied field is known, as in a material test: H + k dB/dt = applied field."""
 
-    k_eddy: Float[Array, ""] = param(0.0, "A/m per T/s", "eddy-current lag k in H + k dB/dt", low=0.0, scale=1.0, typical=(0.01, 10.0))
+    k_eddy: Float[Array, ""] = param(
+        0.0, "A/m per T/s", "eddy-current lag k in H + k dB/dt", low=0.0, scale=1.0, typical=(0.01, 10.0)
+    )
     H_bias: Float[Array, ""] = param(0.0, "A/m", "offset of the applied field", scale=10.0, typical=(-50.0, 50.0))
 
     drive = "field"

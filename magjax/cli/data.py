@@ -13,7 +13,11 @@ def run(command: str, arguments: list[str]) -> int:
 
 def run_check(arguments, _command) -> int:
     """magjax check."""
-    p = parser("check", "Is a recording fit to use? Units, clipping, counts, drift, transient, lag, visited range.", "magjax check rec.csv --bench aa-050h")
+    p = parser(
+        "check",
+        "Is a recording fit to use? Units, clipping, counts, drift, transient, lag, visited range.",
+        "magjax check rec.csv --bench aa-050h",
+    )
     p.add_argument("recordings", nargs="+", help="recordings")
     p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name")
     options = p.parse_args(arguments)
@@ -32,7 +36,11 @@ def run_check(arguments, _command) -> int:
 
 def run_convert(arguments, command) -> int:
     """magjax import and export: recordings from one format into another."""
-    p = parser(command, "Convert recordings: the ending of --out says into what (.nc, .csv, .mat, .parquet).", f"magjax {command} rec.mat --out rec.nc")
+    p = parser(
+        command,
+        "Convert recordings: the ending of --out says into what (.nc, .csv, .mat, .parquet).",
+        f"magjax {command} rec.mat --out rec.nc",
+    )
     p.add_argument("recording", help="a recording")
     p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name")
     p.add_argument("--out", required=True, help="file to write: .nc, .csv, .mat or .parquet")

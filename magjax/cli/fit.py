@@ -101,7 +101,9 @@ def run_diagnose(arguments) -> int:
     """magjax diagnose."""
     p = _common("diagnose", "Say what physics the model leaves out: where, what, how much better with it, what to record next.",
                 "magjax diagnose rec_*.csv --bench aa-050h --check check_*.csv --out result")  # fmt: skip
-    p.add_argument("--calibration", nargs="+", default=[], help="the sensor moved by a known amount: files with reference_m beside the reading")
+    p.add_argument(
+        "--calibration", nargs="+", default=[], help="the sensor moved by a known amount: files with reference_m beside the reading"
+    )
     p.add_argument("--placebo", type=int, default=0, metavar="N",
                    help="fit and screen N simulated recordings that lack nothing: how often the search would cry wolf (some seconds each)")  # fmt: skip
     options = p.parse_args(arguments)
@@ -139,7 +141,9 @@ def run_diagnose(arguments) -> int:
         for row in found.candidates[:8]:
             print(f"  {row.name:26s} z = {row.z:8.1f}   visible from {row.smallest_visible:.3g}")
         if found.placebo:
-            print(f"  placebo: {found.placebo['false_alarms']} false alarms in {found.placebo['runs']} runs, highest z = {max(found.placebo['highest_z']):.1f}")
+            print(
+                f"  placebo: {found.placebo['false_alarms']} false alarms in {found.placebo['runs']} runs, highest z = {max(found.placebo['highest_z']):.1f}"
+            )
         if folder:
             print(f"\nresults in {folder} (report.html, diagnosis.json)")
     return 3 if found.verdict == "data_problem" else 0
@@ -163,7 +167,9 @@ def _diagnose_strain(options, bench, folder) -> int:
     else:
         print(f"{content['verdict']}: {content['message']}")
         for row in content["laws"][:8]:
-            print(f"  {row['law']:8s} {row['variable'] or 'no variable':14s} rms {row['rms']:.3g}, on curves left out {row['held_out_rms']:.3g}")
+            print(
+                f"  {row['law']:8s} {row['variable'] or 'no variable':14s} rms {row['rms']:.3g}, on curves left out {row['held_out_rms']:.3g}"
+            )
         if folder:
             print(f"\nresults in {folder} (diagnosis.json, strain.png)")
     return 0
@@ -171,9 +177,17 @@ def _diagnose_strain(options, bench, folder) -> int:
 
 def run_demo(arguments) -> int:
     """magjax demo."""
-    p = parser("demo", "Invent a bench with concealed physics, record it with noise, fit it, diagnose it, write the report.", "magjax demo --out demo")
+    p = parser(
+        "demo",
+        "Invent a bench with concealed physics, record it with noise, fit it, diagnose it, write the report.",
+        "magjax demo --out demo",
+    )
     p.add_argument("--out", default="magjax-demo", help="folder for recordings and results (default magjax-demo)")
-    p.add_argument("--paper", action="store_true", help="instead: T&B's loops with their constants, and their recipe for R_eddy and xi (Figs. 6-8)")
+    p.add_argument(
+        "--paper",
+        action="store_true",
+        help="instead: T&B's loops with their constants, and their recipe for R_eddy and xi (Figs. 6-8)",
+    )
     options = p.parse_args(arguments)
     prepare_jax()
     folder = output_folder(options.out)

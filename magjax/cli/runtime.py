@@ -35,7 +35,12 @@ class Parser(argparse.ArgumentParser):
 
 def parser(command: str, text: str, example: str) -> Parser:
     """A parser with the common options."""
-    made = Parser(prog=f"magjax {command}", description=text, epilog=f"example: {example}", formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = Parser(
+        prog=f"magjax {command}",
+        description=text,
+        epilog=f"example: {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     made.add_argument("--json", action="store_true", help="print the result as JSON on stdout; progress goes to stderr")
     made.add_argument("--quiet", action="store_true", help="no progress")
     made.add_argument("--seed", type=int, default=0, help="seed of everything random (default 0)")

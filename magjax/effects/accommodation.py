@@ -12,7 +12,9 @@ MEMORY = 0.15  # share of the mean magnetization taken over at a reversal
 class Accommodation(AbstractEffect):
     """At each reversal a running mean of M takes over a share of the present M; the relays' field is shifted by it."""
 
-    shift: Float[Array, ""] = param(0.0, "A/m", "field shift at saturation of the running mean", scale=50.0, null=0.0, typical=(-500.0, 500.0))
+    shift: Float[Array, ""] = param(
+        0.0, "A/m", "field shift at saturation of the running mean", scale=50.0, null=0.0, typical=(-500.0, 500.0)
+    )
 
     name = "accommodation"
     block = "hysteresis"

@@ -21,7 +21,13 @@ class AmplifierClipping(AbstractEffect):
     """
 
     inverse_limit: Float[Array, ""] = param(
-        0.0, "1/A", "resistance over largest voltage: one over the largest steady current", low=0.0, scale=0.1, null=0.0, typical=(0.3, 3.0)
+        0.0,
+        "1/A",
+        "resistance over largest voltage: one over the largest steady current",
+        low=0.0,
+        scale=0.1,
+        null=0.0,
+        typical=(0.3, 3.0),
     )
     tau_L: Float[Array, ""] = param(1e-3, "s", "L/R of coil and leads", low=0.0, scale=1e-3, shape=True, typical=(1e-4, 1e-2))
 

@@ -9,7 +9,9 @@ from .base import AbstractEffect
 class AmplifierLag(AbstractEffect):
     """Command to current: 1/(1 + s tau + order2 (s tau)^2); two equal poles for order2 = 1/4, Butterworth for 1/2."""
 
-    tau: Float[Array, ""] = param(0.0, "s", "lag of the amplifier at low frequency", low=0.0, scale=1e-5, null=0.0, typical=(5e-6, 5e-4))
+    tau: Float[Array, ""] = param(
+        0.0, "s", "lag of the amplifier at low frequency", low=0.0, scale=1e-5, null=0.0, typical=(5e-6, 5e-4)
+    )
     order2: Float[Array, ""] = param(0.0, "1", "second-order share", low=0.0, scale=0.25, shape=True, typical=(0.0, 0.6))
 
     name = "amplifier_lag"

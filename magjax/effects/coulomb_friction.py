@@ -18,8 +18,12 @@ class CoulombFriction(AbstractEffect):
     """
 
     f: Float[Array, ""] = param(0.0, "m", "friction force over stiffness", low=0.0, scale=1e-7, null=0.0, typical=(1e-8, 5e-6))
-    v_s: Float[Array, ""] = param(3e-5, "m/s", "velocity below which friction is viscous", low=0.0, scale=3e-4, shape=True, typical=(1e-6, 3e-2))
-    presliding: Float[Array, ""] = param(3e-8, "m", "way over which friction turns with the motion", low=0.0, scale=1e-7, shape=True, typical=(1e-9, 1e-5))
+    v_s: Float[Array, ""] = param(
+        3e-5, "m/s", "velocity below which friction is viscous", low=0.0, scale=3e-4, shape=True, typical=(1e-6, 3e-2)
+    )
+    presliding: Float[Array, ""] = param(
+        3e-8, "m", "way over which friction turns with the motion", low=0.0, scale=1e-7, shape=True, typical=(1e-9, 1e-5)
+    )
 
     name = "coulomb_friction"
     block = "mechanics"

@@ -15,9 +15,15 @@ class Creep(AbstractEffect):
     How far the mean level has crept depends on how long the drive had run before: `mean_behind`.
     """
 
-    gain: Float[Array, ""] = param(0.0, "1", "displacement added per decade of time", low=0.0, scale=0.01, null=0.0, typical=(0.001, 0.1))
-    shortest: Float[Array, ""] = param(1e-3, "s", "time at which the creep begins", low=1e-5, scale=1e-3, shape=True, typical=(1e-4, 1e-1))
-    mean_behind: Float[Array, ""] = param(0.0, "1", "decades of creep that the mean level has not taken yet", scale=2.0, shape=True, typical=(0.0, 5.0))
+    gain: Float[Array, ""] = param(
+        0.0, "1", "displacement added per decade of time", low=0.0, scale=0.01, null=0.0, typical=(0.001, 0.1)
+    )
+    shortest: Float[Array, ""] = param(
+        1e-3, "s", "time at which the creep begins", low=1e-5, scale=1e-3, shape=True, typical=(1e-4, 1e-1)
+    )
+    mean_behind: Float[Array, ""] = param(
+        0.0, "1", "decades of creep that the mean level has not taken yet", scale=2.0, shape=True, typical=(0.0, 5.0)
+    )
 
     name = "creep"
     block = "mechanics"
@@ -28,6 +34,7 @@ class Creep(AbstractEffect):
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with creep, relative to its settled value, m."""
+
         def decades(s):
             return jnp.where(s == 0, -self.mean_behind, jnp.log((1 + s * self.shortest) / (1 + s * LONGEST)) / jnp.log(10.0))
 

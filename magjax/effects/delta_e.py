@@ -10,8 +10,19 @@ from .forces import with_force
 class DeltaE(AbstractEffect):
     """Relative stiffness 1 + e m^2: the resonance moves with M, and, `static`, the settled displacement under its force too."""
 
-    e: Float[Array, ""] = param(0.0, "1", "relative change of stiffness from m = 0 to saturation", scale=0.1, null=0.0, typical=(-0.5, 1.0))
-    static: Float[Array, ""] = param(0.0, "1", "0: the free strain stays, 1: the rod gives way under a force", low=0.0, high=1.0, scale=0.5, shape=True, typical=(0.0, 1.0))
+    e: Float[Array, ""] = param(
+        0.0, "1", "relative change of stiffness from m = 0 to saturation", scale=0.1, null=0.0, typical=(-0.5, 1.0)
+    )
+    static: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "0: the free strain stays, 1: the rod gives way under a force",
+        low=0.0,
+        high=1.0,
+        scale=0.5,
+        shape=True,
+        typical=(0.0, 1.0),
+    )
 
     name = "delta_e"
     block = "mechanics"

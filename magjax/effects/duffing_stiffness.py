@@ -10,8 +10,12 @@ from .forces import with_force
 class DuffingStiffness(AbstractEffect):
     """Spring that stiffens with the displacement: relative stiffness k3 r^2 (1 + k5 r^2), r = y / saturation displacement."""
 
-    k3: Float[Array, ""] = param(0.0, "1", "relative stiffness added at saturation displacement", scale=0.1, null=0.0, typical=(-1.0, 2.0))
-    k5: Float[Array, ""] = param(0.0, "1", "its growth: relative stiffness k3 r^2 (1 + k5 r^2)", scale=1.0, shape=True, typical=(-1.0, 2.0))
+    k3: Float[Array, ""] = param(
+        0.0, "1", "relative stiffness added at saturation displacement", scale=0.1, null=0.0, typical=(-1.0, 2.0)
+    )
+    k5: Float[Array, ""] = param(
+        0.0, "1", "its growth: relative stiffness k3 r^2 (1 + k5 r^2)", scale=1.0, shape=True, typical=(-1.0, 2.0)
+    )
 
     name = "duffing_stiffness"
     block = "mechanics"

@@ -9,7 +9,9 @@ from .base import AbstractEffect
 class EddyCurrents(AbstractEffect):
     """The linear eddy field k dB/dt of T&B (3), as an effect of its own."""
 
-    k: Float[Array, ""] = param(0.0, "A/m per T/s", "eddy field per rate of the flux density", low=0.0, scale=0.1, null=0.0, typical=(1e-3, 10.0))
+    k: Float[Array, ""] = param(
+        0.0, "A/m per T/s", "eddy field per rate of the flux density", low=0.0, scale=0.1, null=0.0, typical=(1e-3, 10.0)
+    )
 
     name = "eddy_currents"
     block = "coil"

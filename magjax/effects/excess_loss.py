@@ -9,8 +9,12 @@ from .base import AbstractEffect
 class ExcessLoss(AbstractEffect):
     """Bertotti's excess field. `rate_knee` smooths the root near dB/dt = 0, where few walls move (his n0 and V0)."""
 
-    k: Float[Array, ""] = param(0.0, "A/m (s/T)^0.5", "excess field per root of dB/dt", low=0.0, scale=10.0, null=0.0, typical=(1.0, 200.0))
-    rate_knee: Float[Array, ""] = param(1.0, "T/s", "rate below which the field is linear in dB/dt", low=0.0, scale=1.0, shape=True, typical=(0.01, 100.0))
+    k: Float[Array, ""] = param(
+        0.0, "A/m (s/T)^0.5", "excess field per root of dB/dt", low=0.0, scale=10.0, null=0.0, typical=(1.0, 200.0)
+    )
+    rate_knee: Float[Array, ""] = param(
+        1.0, "T/s", "rate below which the field is linear in dB/dt", low=0.0, scale=1.0, shape=True, typical=(0.01, 100.0)
+    )
 
     name = "excess_loss"
     block = "coil"

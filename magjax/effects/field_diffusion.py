@@ -13,13 +13,24 @@ BELOW = 0.02  # step has a solution: least share
 class FieldDiffusion(AbstractEffect):
     """Skin effect of a solid cylinder: shells with their own field and relays in place of one loss k dB/dt for all (`chain.shells`)."""
 
-    kappa: Float[Array, ""] = param(0.0, "1", "share of the loss that is distributed as in a solid cylinder", low=0.0, high=1.0, scale=0.3, null=0.0, typical=(0.05, 1.0))
+    kappa: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "share of the loss that is distributed as in a solid cylinder",
+        low=0.0,
+        high=1.0,
+        scale=0.3,
+        null=0.0,
+        typical=(0.05, 1.0),
+    )
 
     name = "field_diffusion"
     block = "coil"
     law = "k dB/dt -> k [(1 - kappa) mean_j dB_j/dt + kappa mean_j D_ij dB_j/dt] in shell i, D_ij = mean of -2 ln max(u, u'), u = (r/R)^2"
     source = "Ampere's and Faraday's laws in a conducting cylinder: J. Lammeraner, M. Stafl, Eddy Currents, 1966"
-    signature = "the eddy lag grows more slowly than frequency, and the skin switches ahead of the core: rounded corners at high frequency"
+    signature = (
+        "the eddy lag grows more slowly than frequency, and the skin switches ahead of the core: rounded corners at high frequency"
+    )
     amplitude = "kappa"
     in_step = True
     shells = 4

@@ -94,7 +94,8 @@ class LearnedTerm(AbstractEffect):
         """c0, c1, ...: held by their prior deviation (a shape has two of its scales)."""
         meaning = "coefficient of the learned function"
         return {
-            f"c{k}": ParameterInfo("1", meaning, scale=0.5 * float(d), null=0.0, shape=True) for k, d in enumerate(np.asarray(self.deviation))
+            f"c{k}": ParameterInfo("1", meaning, scale=0.5 * float(d), null=0.0, shape=True)
+            for k, d in enumerate(np.asarray(self.deviation))
         }
 
     def basis(self, *values, xp=jnp):

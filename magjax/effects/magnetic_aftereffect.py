@@ -13,8 +13,19 @@ TIMES = (1e-3, 1e-2, 1e-1, 1.0)  # s, one lag a decade makes log time
 class MagneticAftereffect(AbstractEffect):
     """A share of the magnetization arrives late, through a ladder of lags, equal a decade; or, `of_field`, of the field."""
 
-    share: Float[Array, ""] = param(0.0, "1", "share that arrives late, over four decades", low=0.0, scale=0.02, null=0.0, typical=(0.002, 0.2))
-    of_field: Float[Array, ""] = param(0.0, "1", "0: the relays' magnetization is late, 1: the field that they see", low=0.0, high=1.0, scale=0.5, shape=True, typical=(0.0, 1.0))
+    share: Float[Array, ""] = param(
+        0.0, "1", "share that arrives late, over four decades", low=0.0, scale=0.02, null=0.0, typical=(0.002, 0.2)
+    )
+    of_field: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "0: the relays' magnetization is late, 1: the field that they see",
+        low=0.0,
+        high=1.0,
+        scale=0.5,
+        shape=True,
+        typical=(0.0, 1.0),
+    )
 
     name = "magnetic_aftereffect"
     block = "hysteresis"

@@ -14,9 +14,20 @@ def page() -> str:
         "| effect | block | law | shows in data as |", "|---|---|---|---|",
     ]  # fmt: skip
     for effect in CATALOGUE:
-        lines.append(f"| [{effect.name}](#{effect.name}) | {effect.block} | `{effect.law.replace('|', chr(92) + '|')}` | {effect.signature} |")
+        lines.append(
+            f"| [{effect.name}](#{effect.name}) | {effect.block} | `{effect.law.replace('|', chr(92) + '|')}` | {effect.signature} |"
+        )
     for effect in CATALOGUE:
-        lines += ["", f"## {effect.name}", "", " ".join((effect.__doc__ or "").split()), "", f"Law: `{effect.law}`  ", f"Source: {effect.source}", ""]
+        lines += [
+            "",
+            f"## {effect.name}",
+            "",
+            " ".join((effect.__doc__ or "").split()),
+            "",
+            f"Law: `{effect.law}`  ",
+            f"Source: {effect.source}",
+            "",
+        ]
         lines += ["| parameter | unit | null | typical | meaning |", "|---|---|---|---|---|"]
         for name, info in effect.parameters().items():
             null = "shape" if info.shape else f"{info.null:g}" if info.null is not None else ""

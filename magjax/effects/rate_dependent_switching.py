@@ -14,9 +14,22 @@ class RateDependentSwitching(AbstractEffect):
     B counts by the mean susceptibility chi of the plane, so that both rates are of one size, A/m/s.
     """
 
-    gamma: Float[Array, ""] = param(0.0, "A/m", "coercive shift per e-fold of the rate", low=0.0, scale=10.0, null=0.0, typical=(1.0, 200.0))
-    rate0: Float[Array, ""] = param(1e4, "A/m/s", "rate at which the shift sets in", low=0.0, scale=1e4, shape=True, typical=(1e2, 1e7))
-    of_flux: Float[Array, ""] = param(0.0, "1", "0: the rate of the field, 1: that of the flux density", low=0.0, high=1.0, scale=0.5, shape=True, typical=(0.0, 1.0))
+    gamma: Float[Array, ""] = param(
+        0.0, "A/m", "coercive shift per e-fold of the rate", low=0.0, scale=10.0, null=0.0, typical=(1.0, 200.0)
+    )
+    rate0: Float[Array, ""] = param(
+        1e4, "A/m/s", "rate at which the shift sets in", low=0.0, scale=1e4, shape=True, typical=(1e2, 1e7)
+    )
+    of_flux: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "0: the rate of the field, 1: that of the flux density",
+        low=0.0,
+        high=1.0,
+        scale=0.5,
+        shape=True,
+        typical=(0.0, 1.0),
+    )
 
     name = "rate_dependent_switching"
     block = "hysteresis"

@@ -10,7 +10,9 @@ from .base import AbstractEffect
 class ReversibleMagnetization(AbstractEffect):
     """State-dependent reversible susceptibility chi_r (1 - m^2), m = M/M_s of the relays."""
 
-    chi_r: Float[Array, ""] = param(0.0, "1", "reversible susceptibility at m = 0", low=0.0, scale=0.5, null=0.0, typical=(0.1, 10.0))
+    chi_r: Float[Array, ""] = param(
+        0.0, "1", "reversible susceptibility at m = 0", low=0.0, scale=0.5, null=0.0, typical=(0.1, 10.0)
+    )
 
     name = "reversible_magnetization"
     block = "hysteresis"

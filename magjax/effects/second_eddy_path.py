@@ -11,9 +11,20 @@ from .lags import lagged, repeated
 class SecondEddyPath(AbstractEffect):
     """A shorted turn that links the flux of the rod or, `air`, that of the coil beside it: two limits with all between."""
 
-    kappa: Float[Array, ""] = param(0.0, "1", "its field relative to the rod's eddy field, or to the coil's", low=0.0, scale=0.3, null=0.0, typical=(0.02, 2.0))
+    kappa: Float[Array, ""] = param(
+        0.0, "1", "its field relative to the rod's eddy field, or to the coil's", low=0.0, scale=0.3, null=0.0, typical=(0.02, 2.0)
+    )
     tau: Float[Array, ""] = param(5e-4, "s", "L/R of the second path", low=0.0, scale=5e-4, shape=True, typical=(3e-5, 1e-2))
-    air: Float[Array, ""] = param(0.0, "1", "share of the coil's own flux in what drives it: 0 round the rod, 1 round the coil", low=0.0, high=1.0, scale=0.5, shape=True, typical=(0.0, 1.0))
+    air: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "share of the coil's own flux in what drives it: 0 round the rod, 1 round the coil",
+        low=0.0,
+        high=1.0,
+        scale=0.5,
+        shape=True,
+        typical=(0.0, 1.0),
+    )
 
     name = "second_eddy_path"
     block = "coil"

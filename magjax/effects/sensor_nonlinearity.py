@@ -10,10 +10,18 @@ class SensorNonlinearity(AbstractEffect):
     """Departure from a straight line over the range of the sensor, of second to sixth order."""
 
     q2: Float[Array, ""] = param(0.0, "1", "quadratic departure at full range", scale=0.01, null=0.0, typical=(-0.1, 0.1))
-    c3: Float[Array, ""] = param(0.0, "1", "cubic departure relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0))
-    c4: Float[Array, ""] = param(0.0, "1", "departure of fourth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0))
-    c5: Float[Array, ""] = param(0.0, "1", "departure of fifth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0))
-    c6: Float[Array, ""] = param(0.0, "1", "departure of sixth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0))
+    c3: Float[Array, ""] = param(
+        0.0, "1", "cubic departure relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
+    )
+    c4: Float[Array, ""] = param(
+        0.0, "1", "departure of fourth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
+    )
+    c5: Float[Array, ""] = param(
+        0.0, "1", "departure of fifth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
+    )
+    c6: Float[Array, ""] = param(
+        0.0, "1", "departure of sixth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
+    )
 
     name = "sensor_nonlinearity"
     block = "sensor"
@@ -26,4 +34,6 @@ class SensorNonlinearity(AbstractEffect):
         """Reading through the curve."""
         reach = actuator.magnetostriction.reach if actuator.magnetostriction is not None else 1.0
         part = reading / reach
-        return reading + reach * part * part * self.q2 * (1 + part * (self.c3 + part * (self.c4 + part * (self.c5 + part * self.c6))))
+        return reading + reach * part * part * self.q2 * (
+            1 + part * (self.c3 + part * (self.c4 + part * (self.c5 + part * self.c6)))
+        )

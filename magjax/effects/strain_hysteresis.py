@@ -15,7 +15,9 @@ class StrainHysteresis(AbstractEffect):
 
     share: Float[Array, ""] = param(0.0, "1", "share of the strain that lags", scale=0.1, null=0.0, typical=(0.01, 0.5))
 
-    width: Float[Array, ""] = param(0.1, "1", "half-width of the widest play relative to saturation strain", low=0.0, scale=0.1, shape=True, typical=(0.01, 0.3))
+    width: Float[Array, ""] = param(
+        0.1, "1", "half-width of the widest play relative to saturation strain", low=0.0, scale=0.1, shape=True, typical=(0.01, 0.3)
+    )
 
     name = "strain_hysteresis"
     block = "magnetostriction"

@@ -11,7 +11,9 @@ from .base import AbstractEffect
 class StressFeedback(AbstractEffect):
     """The relays see H + (3 lambda_s sigma/(mu0 M_s^2)) M with sigma = -stiffness y from the mechanics (5)."""
 
-    stiffness: Float[Array, ""] = param(0.0, "Pa/m", "stress in the rod per displacement (preload spring, load)", low=0.0, scale=1e10, null=0.0, typical=(1e9, 1e12))
+    stiffness: Float[Array, ""] = param(
+        0.0, "Pa/m", "stress in the rod per displacement (preload spring, load)", low=0.0, scale=1e10, null=0.0, typical=(1e9, 1e12)
+    )
 
     name = "stress_feedback"
     block = "hysteresis"

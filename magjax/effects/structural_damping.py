@@ -15,8 +15,12 @@ class StructuralDamping(AbstractEffect):
     """
 
     eta: Float[Array, ""] = param(0.0, "1", "loss factor", low=0.0, scale=0.02, null=0.0, typical=(0.001, 0.2))
-    dispersion: Float[Array, ""] = param(1.0, "1", "growth of the stiffness with frequency: 1 causal, 0 classic", scale=1.0, shape=True, typical=(0.0, 1.0))
-    exponent: Float[Array, ""] = param(0.05, "1", "order of the fractional derivative", low=0.0, scale=0.05, shape=True, typical=(0.01, 0.5))
+    dispersion: Float[Array, ""] = param(
+        1.0, "1", "growth of the stiffness with frequency: 1 causal, 0 classic", scale=1.0, shape=True, typical=(0.0, 1.0)
+    )
+    exponent: Float[Array, ""] = param(
+        0.05, "1", "order of the fractional derivative", low=0.0, scale=0.05, shape=True, typical=(0.01, 0.5)
+    )
 
     name = "structural_damping"
     block = "mechanics"

@@ -10,7 +10,9 @@ from .base import AbstractEffect
 class ThermalDrift(AbstractEffect):
     """Expansion behind the heat I^2 R by one thermal time constant, from cold at the start of the record."""
 
-    rate: Float[Array, ""] = param(0.0, "m/(A^2 s)", "expansion rate per squared current", scale=1e-7, null=0.0, typical=(1e-9, 1e-4))
+    rate: Float[Array, ""] = param(
+        0.0, "m/(A^2 s)", "expansion rate per squared current", scale=1e-7, null=0.0, typical=(1e-9, 1e-4)
+    )
     tau: Float[Array, ""] = param(30.0, "s", "thermal time constant", low=0.0, scale=30.0, shape=True, typical=(0.05, 600.0))
 
     name = "thermal_drift"

@@ -91,7 +91,9 @@ class Preisach(eqx.Module):
         heights = max(rest - low, high - rest) * (1 - np.arange(alternations) / alternations)
         history = np.append(np.clip(rest + heights * (-1.0) ** np.arange(alternations), low, high), rest)
         history = np.append(history, np.asarray(self.history))
-        made = Preisach(self.masses, self.low, self.high, self.offset, history if rest < high else np.append(high, np.asarray(self.history)))
+        made = Preisach(
+            self.masses, self.low, self.high, self.offset, history if rest < high else np.append(high, np.asarray(self.history))
+        )
         return made
 
     def table(self):

@@ -52,7 +52,12 @@ def static_path(field, low: float) -> StaticPath:
             depth.append(depth[parents[k - 1]] + 1)
             stack.append((last, len(corners) - 1))
         previous = direction or previous
-        while len(stack) >= 3 and min(stack[-1][0], stack[-2][0]) > value or len(stack) >= 3 and max(stack[-1][0], stack[-2][0]) < value:
+        while (
+            len(stack) >= 3
+            and min(stack[-1][0], stack[-2][0]) > value
+            or len(stack) >= 3
+            and max(stack[-1][0], stack[-2][0]) < value
+        ):
             del stack[-2:]
         if len(stack) == 2 and value <= stack[0][0]:
             del stack[1:]

@@ -37,7 +37,7 @@ def best(function, repeats=5, least=0.2):
 def actuator_at(level: int = 25):
     """T&B's bench on a plane of another level."""
     actuator = load_bench("aa-050h").actuator()
-    masses = density_masses(lambda s, r: np.exp(-((s - 1.1e4) / 6e3) ** 2) / (1 + (r / 1500) ** 2), level, -2e3, 2.7e4, 3.9e5)
+    masses = density_masses(lambda s, r: np.exp(-(((s - 1.1e4) / 6e3) ** 2)) / (1 + (r / 1500) ** 2), level, -2e3, 2.7e4, 3.9e5)
     import dataclasses
 
     return dataclasses.replace(actuator, hysteresis=Preisach(masses, -2e3, 2.7e4, 3.9e5))
@@ -77,7 +77,9 @@ def batch():
     for number in (64, 1000):
         run = jax.jit(jax.vmap(lambda c: run_chain(actuator, c, dt, 0, 4).magnetization))
         currents = scale[:number] * jnp.asarray(current)
-        found[f"batch of {number}, per trajectory over compiled loop (bar <= 0.35)"] = best(lambda r=run, c=currents: r(c), 3) / number / loop
+        found[f"batch of {number}, per trajectory over compiled loop (bar <= 0.35)"] = (
+            best(lambda r=run, c=currents: r(c), 3) / number / loop
+        )
     times = []
     for level in (25, 50, 100, 200):
         big = actuator_at(level)
@@ -107,7 +109,11 @@ def derivatives():
 
     column = best(lambda f=jax.jit(columns): f(masses), 2) / 200
     reverse = best(lambda f=jax.jit(jax.grad(lambda m: jnp.sum(reading(m) ** 2))): f(masses))
-    return {"jvp, forwards (bar <= 1.7)": jvp / forward, "Jacobian column, forwards (bar <= 0.5)": column / forward, "reverse, forwards (bar <= 3)": reverse / forward}
+    return {
+        "jvp, forwards (bar <= 1.7)": jvp / forward,
+        "Jacobian column, forwards (bar <= 0.5)": column / forward,
+        "reverse, forwards (bar <= 3)": reverse / forward,
+    }
 
 
 def static():
@@ -121,7 +127,9 @@ def static():
     for level in (25, 200):
         h = actuator_at(level).hysteresis
         run = static_value_and_gradient(lambda M: jnp.sum(M**2), h.low, h.high, h.offset, path)
-        stream = jax.jit(lambda m, h=h: Preisach.magnetization(jax.tree_util.tree_map(lambda x: x, h), jnp.asarray(field), corners=48))
+        stream = jax.jit(
+            lambda m, h=h: Preisach.magnetization(jax.tree_util.tree_map(lambda x: x, h), jnp.asarray(field), corners=48)
+        )
         ours = best(lambda r=run, h=h: r(h.masses))
         found[f"L = {level}: value and gradient, ms (bar <= 1)"] = 1e3 * ours
         found[f"L = {level}: streaming forward over ours"] = best(lambda s=stream, h=h: s(h.masses), 2) / ours
@@ -155,7 +163,11 @@ def grid():
     current = 0.1 + 0.5 * np.sin(2 * np.pi * np.arange(4 * 200) / 200)
     applied = np.asarray(actuator.coil.applied_field(jnp.asarray(current)))
     loop = best(lambda: baselines.compiled_loop(actuator, applied, 1 / (100 * 200)))
-    return {"4000 trajectories, s (bar <= 0.5)": ours, "compiled serial loop over ours": 4000 * loop / ours, "peak memory grown by, MB (bar <= 150)": grown}
+    return {
+        "4000 trajectories, s (bar <= 0.5)": ours,
+        "compiled serial loop over ours": 4000 * loop / ours,
+        "peak memory grown by, MB (bar <= 150)": grown,
+    }
 
 
 def inversion():
@@ -180,7 +192,11 @@ def inversion():
     slow = best(bisection, 1, 0) * len(targets) / 100
     many = operator.offset + 0.9 * operator.total * np.sin(np.arange(1_000_000) * 0.01)
     fast = best(lambda: operator.copy().invert(many, accelerate=True), 2)
-    return {"bisection over pure inversion (bar >= 15)": slow / ours, "pure, us a smooth sample (bar <= 10)": ours / len(targets) * 1e6, "compiled, us a smooth sample (bar <= 0.5)": fast}
+    return {
+        "bisection over pure inversion (bar >= 15)": slow / ours,
+        "pure, us a smooth sample (bar <= 10)": ours / len(targets) * 1e6,
+        "compiled, us a smooth sample (bar <= 0.5)": fast,
+    }
 
 
 def l1():
@@ -190,7 +206,16 @@ def l1():
     return {"l1 design at 40 taps, s (bar < 0.3)": best(design, 3)}
 
 
-GROUPS = {"single": single, "batch": batch, "derivatives": derivatives, "static": static, "memory": memory, "sweep": grid, "inversion": inversion, "l1": l1}
+GROUPS = {
+    "single": single,
+    "batch": batch,
+    "derivatives": derivatives,
+    "static": static,
+    "memory": memory,
+    "sweep": grid,
+    "inversion": inversion,
+    "l1": l1,
+}
 
 
 def main():

@@ -147,7 +147,9 @@ def _varied(rng):
     """Six to nine sines of as many amplitudes and offsets; the slowest spans the plane."""
     count = int(rng.integers(6, 10))
     frequencies = np.sort(rng.choice(FREQUENCIES[1:], count - 1, replace=False))
-    rows = [{"frequency": float(FREQUENCIES[0]), "amplitude": _round(rng.uniform(0.78, 0.85)), "offset": _round(rng.uniform(0, 0.1))}]
+    rows = [
+        {"frequency": float(FREQUENCIES[0]), "amplitude": _round(rng.uniform(0.78, 0.85)), "offset": _round(rng.uniform(0, 0.1))}
+    ]
     for f in frequencies:
         rows.append({"frequency": float(f), "amplitude": _round(rng.uniform(0.2, 0.75)), "offset": _round(rng.uniform(-0.2, 0.2))})
     return tuple(rows)

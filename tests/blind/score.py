@@ -91,7 +91,11 @@ def _folders(suite, out):
         folder = out / f"{suite}-{k:03d}"
         if (folder / "done.json").exists():
             path = folder / "result" / "diagnosis.json"
-            yield folder.name, json.loads((folder / "done.json").read_text()), json.loads(path.read_text()) if path.exists() else None
+            yield (
+                folder.name,
+                json.loads((folder / "done.json").read_text()),
+                json.loads(path.read_text()) if path.exists() else None,
+            )
 
 
 def _kept(path):
@@ -110,7 +114,11 @@ def kept_line(name: str, done: dict, diagnosis) -> str:
         fits = {}
         for key in ("base", "repaired"):
             fitted = diagnosis.get(key)
-            known = {n: {k: p.get(k) for k in ("value", "stderr")} for n, p in fitted.get("parameters", {}).items() if n in SCORED} if fitted else {}
+            known = (
+                {n: {k: p.get(k) for k in ("value", "stderr")} for n, p in fitted.get("parameters", {}).items() if n in SCORED}
+                if fitted
+                else {}
+            )
             fits[key] = {"chi2_per_sample": fitted["chi2_per_sample"], "parameters": known} if fitted else None
         row["diagnosis"] = {
             "verdict": diagnosis["verdict"], "groups": diagnosis["groups"], "absorbed": diagnosis["absorbed"],
@@ -191,10 +199,14 @@ def _foretold(rows) -> list[str]:
     """Error on check recordings after the diagnosis in units of their noise, where nothing outside the catalogue acts."""
     lines = []
     for title, kinds in (("nulls", ("null", "decoy", "hidden")), ("one effect or two", ("single", "pair"))):
-        ratios = [c["rms_after"] / c["noise_rms"] for case, d, _ in rows if d and case.kind in kinds for c in d["check"] if c["noise_rms"]]
+        ratios = [
+            c["rms_after"] / c["noise_rms"] for case, d, _ in rows if d and case.kind in kinds for c in d["check"] if c["noise_rms"]
+        ]
         if ratios:
             middle, high = np.quantile(ratios, (0.5, 0.9))
-            lines.append(f"Check error after the diagnosis over the noise, {title}: median {middle:.2f}, nine tenths below {high:.2f} ({len(ratios)}).")
+            lines.append(
+                f"Check error after the diagnosis over the noise, {title}: median {middle:.2f}, nine tenths below {high:.2f} ({len(ratios)})."
+            )
     return lines
 
 
@@ -212,7 +224,9 @@ def _believed(rows) -> list[str]:
         if got:
             true = sum(t for t, _ in got)
             low, high = wilson(true, len(got))
-            lines.append(f"| {band} | {len(got)} | {np.mean([c for _, c in got]):.2f} | {true}/{len(got)}: {low:.0%} to {high:.0%} |")
+            lines.append(
+                f"| {band} | {len(got)} | {np.mean([c for _, c in got]):.2f} | {true}/{len(got)}: {low:.0%} to {high:.0%} |"
+            )
     return lines
 
 

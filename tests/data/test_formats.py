@@ -19,7 +19,9 @@ def columns():
 
 @pytest.fixture
 def bench():
-    return dataclasses.replace(load_bench("aa-050h"), columns={"displacement": {"name": "lvdt_volts", "scale": 25.0, "offset": -5.0, "unit": "um"}})
+    return dataclasses.replace(
+        load_bench("aa-050h"), columns={"displacement": {"name": "lvdt_volts", "scale": 25.0, "offset": -5.0, "unit": "um"}}
+    )
 
 
 def expected():

@@ -76,7 +76,9 @@ def test_units_in_names_become_si(tmp_path, unit, scale):
     np.savetxt(path, rows, delimiter=",", header=f"# date: today\ntime_ms,{unit}", comments="", fmt="%.12g")
     got = load_recordings([path], "aa-050h")[0]
     assert got.channels["displacement"] == pytest.approx(original.channels["displacement"], rel=1e-9)
-    assert got.channels["current"] == pytest.approx(original.channels["current"], abs=1e-10) and got.dt == pytest.approx(original.dt)
+    assert got.channels["current"] == pytest.approx(original.channels["current"], abs=1e-10) and got.dt == pytest.approx(
+        original.dt
+    )
     assert got.origin["metadata"]["date"] == "today" and len(got.origin["sha256"]) == 64
 
 

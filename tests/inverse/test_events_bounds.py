@@ -224,7 +224,9 @@ def test_names_of_the_plain_actuator():
 
 @pytest.mark.parametrize("order2", [0.0, 0.1, 0.25, 0.5])
 def test_the_mean_current_behind_an_amplifier_is_its_equation_integrated(order2):
-    plant = dataclasses.replace(PlainActuator.from_actuator(actuator(8)), effects={"amplifier_lag": {"tau": 3e-4, "order2": order2}})
+    plant = dataclasses.replace(
+        PlainActuator.from_actuator(actuator(8)), effects={"amplifier_lag": {"tau": 3e-4, "order2": order2}}
+    )
     events = HeldCurrent(plant, 0.2)
     means = [events._delivered(0.7, 1e-4) for _ in range(6)]
     t = np.linspace(0, 6e-4, 6001)

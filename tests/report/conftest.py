@@ -90,7 +90,14 @@ def diagnoses(runs, bench, fitted, poor):
             "attributed", f"{names[0]} (source) was left out.", (effect,), repaired=fitted, absorbed=(ranked[-1].name,), **common
         ),
         "group": Diagnosis(
-            "group", "cannot tell apart.", (), (tuple(names),), rivals={names[1]: effect["parameters"]}, next_experiment=ask, repaired=fitted, **common
+            "group",
+            "cannot tell apart.",
+            (),
+            (tuple(names),),
+            rivals={names[1]: effect["parameters"]},
+            next_experiment=ask,
+            repaired=fitted,
+            **common,
         ),
         "unknown_at": Diagnosis(
             "unknown_at",

@@ -26,7 +26,17 @@ from tests.blind.generator.bench import ConcealedBench  # noqa: E402
 
 TRUTH = {"R_eddy": 62.0, "f0": 405.0, "xi": 0.81, "H_bias": 1.23e4}
 NAMES = {"coil.R_eddy": "R_eddy", "mechanics.f0": "f0", "mechanics.xi": "xi"}
-SINES = [(10, 0.8, 0.1), (25, 0.4, -0.2), (50, 0.8, 0.0), (80, 0.4, 0.3), (120, 0.8, 0.1), (160, 0.4, 0.0), (200, 0.8, -0.05), (250, 0.4, 0.2), (300, 0.8, 0.1)]
+SINES = [
+    (10, 0.8, 0.1),
+    (25, 0.4, -0.2),
+    (50, 0.8, 0.0),
+    (80, 0.4, 0.3),
+    (120, 0.8, 0.1),
+    (160, 0.4, 0.0),
+    (200, 0.8, -0.05),
+    (250, 0.4, 0.2),
+    (300, 0.8, 0.1),
+]
 CHECK = [(400, 0.6, 0.05), (65, 0.6, 0.0)]
 
 
@@ -51,13 +61,40 @@ def draws(numbers=10):
         for draw in range(numbers):
             rng = np.random.default_rng(1000 + draw)
             recordings = [noisy(y[k], current[k], d["frequency"], rng, 41e-9, str(k)) for k, d in enumerate(everything)]
-            start = bench.actuator().replace({"coil.R_eddy": 62 * rng.uniform(0.6, 1.4), "mechanics.xi": 0.81 * rng.uniform(0.6, 1.4), "mechanics.f0": 405 * rng.uniform(0.8, 1.2)})
+            start = bench.actuator().replace(
+                {
+                    "coil.R_eddy": 62 * rng.uniform(0.6, 1.4),
+                    "mechanics.xi": 0.81 * rng.uniform(0.6, 1.4),
+                    "mechanics.f0": 405 * rng.uniform(0.8, 1.2),
+                }
+            )
             found = fit(recordings[: len(SINES)], bench, actuator=start)
             pulls = {v: (found.estimate(k).value - TRUTH[v]) / found.estimate(k).stderr for k, v in NAMES.items()}
             off = {v: found.estimate(k).value / TRUTH[v] - 1 for k, v in NAMES.items()}
-            check = [r["rms_after"] / r["noise_rms"] for r in check_errors(found.actuator, found.actuator, recordings[len(SINES) :], bench)]
-            rows.append({"density": density, "draw": draw, "chi2n": found.chi2_per_sample, "pulls": pulls, "relative": off, "check": check, "seconds": found.solve_s})
-            print(density, draw, round(found.chi2_per_sample, 3), {k: round(float(v), 2) for k, v in pulls.items()}, np.round(check, 2), round(found.solve_s, 1), flush=True)
+            check = [
+                r["rms_after"] / r["noise_rms"]
+                for r in check_errors(found.actuator, found.actuator, recordings[len(SINES) :], bench)
+            ]
+            rows.append(
+                {
+                    "density": density,
+                    "draw": draw,
+                    "chi2n": found.chi2_per_sample,
+                    "pulls": pulls,
+                    "relative": off,
+                    "check": check,
+                    "seconds": found.solve_s,
+                }
+            )
+            print(
+                density,
+                draw,
+                round(found.chi2_per_sample, 3),
+                {k: round(float(v), 2) for k, v in pulls.items()},
+                np.round(check, 2),
+                round(found.solve_s, 1),
+                flush=True,
+            )
     return rows
 
 
@@ -96,11 +133,28 @@ def cells(form: str, seeds=5):
         recordings = []
         for (f, _, _), (current, y) in zip(loops, readings, strict=True):
             noise = 0.005 * np.ptp(y)
-            recordings.append(Recording(np.arange(500) / (f * 500), {"current": current, "displacement": y + noise * rng.standard_normal(500)}, {"displacement": noise}, {}, f"{f} Hz"))
+            recordings.append(
+                Recording(
+                    np.arange(500) / (f * 500),
+                    {"current": current, "displacement": y + noise * rng.standard_normal(500)},
+                    {"displacement": noise},
+                    {},
+                    f"{f} Hz",
+                )
+            )
         start = bench.actuator().replace({"coil.R_eddy": 62 * 1.4, "mechanics.xi": 0.81 * 0.6, "mechanics.f0": 405 * 1.4})
         stated = dataclasses.replace(bench, priors={"coil.H_bias": 100.0})  # else a gauge against the density
         found = fit(recordings, stated, actuator=start, extra=("coil.H_bias",), choices=Choices(knots=None, level=25), refine=False)
-        rows.append({"form": form, "seed": seed, "chi2n": found.chi2_per_sample, **_errors(found), "jacobians": found.jacobians, "seconds": found.solve_s})
+        rows.append(
+            {
+                "form": form,
+                "seed": seed,
+                "chi2n": found.chi2_per_sample,
+                **_errors(found),
+                "jacobians": found.jacobians,
+                "seconds": found.solve_s,
+            }
+        )
         print(rows[-1], flush=True)
     return rows
 

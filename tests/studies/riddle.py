@@ -81,7 +81,10 @@ def calibrations(seed: int = 2) -> list:
     for f in SHAKER:
         x = np.tile(2e-5 * np.sin(2 * np.pi * np.arange(STEPS) / STEPS), PERIODS)
         y = response(x[None], np.array([f / PERIODS]), butterworth)[0]
-        channels = {"reference": x + REFERENCE_NOISE * rng.standard_normal(len(x)), "displacement": y + NOISE * rng.standard_normal(len(x))}
+        channels = {
+            "reference": x + REFERENCE_NOISE * rng.standard_normal(len(x)),
+            "displacement": y + NOISE * rng.standard_normal(len(x)),
+        }
         rows.append(Recording(np.arange(len(x)) / (f * STEPS), channels, {}, {}, f"shaker_{f}Hz"))
     return rows
 

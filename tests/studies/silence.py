@@ -35,7 +35,12 @@ def silence(command, cwd=None, timeout: float = 600.0):
     child.kill() if child.poll() is None else None
     status = child.wait()
     os.close(ours)
-    return first if first is not None else time.monotonic() - begin, max(gap, time.monotonic() - last), status, text.decode(errors="replace")
+    return (
+        first if first is not None else time.monotonic() - begin,
+        max(gap, time.monotonic() - last),
+        status,
+        text.decode(errors="replace"),
+    )
 
 
 COMMANDS = (
@@ -49,5 +54,7 @@ if __name__ == "__main__":
     chosen = [" ".join(sys.argv[2:])] if len(sys.argv) > 2 else COMMANDS
     with tempfile.TemporaryDirectory() as folder:
         for words in chosen:
-            first, gap, status, _ = silence([sys.executable, "-m", "magjax", *words.split()], cwd=folder if len(sys.argv) < 3 else None)
+            first, gap, status, _ = silence(
+                [sys.executable, "-m", "magjax", *words.split()], cwd=folder if len(sys.argv) < 3 else None
+            )
             print(f"{words:70s} first {first:5.2f} s, longest silence {gap:5.2f} s, status {status}")

@@ -49,7 +49,9 @@ def written(action: argparse.Action) -> str:
     name = ", ".join(action.option_strings) or action.metavar or action.dest.upper()
     if action.nargs == 0 or (not action.option_strings and action.nargs is None):
         return f"`{name}`"
-    value = (action.metavar or ("|".join(action.choices) if action.choices else action.dest.upper())) if action.option_strings else name
+    value = (
+        (action.metavar or ("|".join(action.choices) if action.choices else action.dest.upper())) if action.option_strings else name
+    )
     value = {"+": f"{value}...", "*": f"[{value}...]", "?": f"[{value}]"}.get(action.nargs, value)
     return f"`{name} {value}`" if action.option_strings else f"`{value}`"
 

@@ -9,7 +9,20 @@ from magjax.effects import CATALOGUE
 from magjax.page import deliver, extent, number, table
 from magjax.param import parameters_of
 
-GREEK = {"alpha": "α", "beta": "β", "chi": "χ", "eta": "η", "gamma": "γ", "kappa": "κ", "lambda": "λ", "mu": "μ", "sigma": "σ", "tau": "τ", "xi": "ξ", "zeta": "ζ"}
+GREEK = {
+    "alpha": "α",
+    "beta": "β",
+    "chi": "χ",
+    "eta": "η",
+    "gamma": "γ",
+    "kappa": "κ",
+    "lambda": "λ",
+    "mu": "μ",
+    "sigma": "σ",
+    "tau": "τ",
+    "xi": "ξ",
+    "zeta": "ζ",
+}
 BLOCKS = (
     ("coil", Coil, "Driven by a current, T&B (3)-(4): `H + k dB/dt = c0 I + H_bias` with `k = c0 N_m A_m / R_eddy`."),
     ("coil", FieldCoil, "Driven by a known field, where `[coil]` holds `k_eddy`: `H + k dB/dt = applied field`."),
@@ -60,7 +73,15 @@ def rows(module, prefix: str):
     """One row a declared parameter."""
     for name, info in parameters_of(module).items():
         default = number(info.default)
-        yield symbol(name), f"`{prefix}{name}`", info.unit, info.meaning, default, extent(info.typical), extent((info.low, info.high))
+        yield (
+            symbol(name),
+            f"`{prefix}{name}`",
+            info.unit,
+            info.meaning,
+            default,
+            extent(info.typical),
+            extent((info.low, info.high)),
+        )
 
 
 def page() -> str:

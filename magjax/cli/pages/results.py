@@ -91,7 +91,14 @@ def page() -> str:
         "check": ("magjax check --json", "A list with one entry a recording.", CHECK),
     }
     for name, (title, text, meanings) in texts.items():
-        lines += ["", f"## {title}", "", text, "", *table(("key", "meaning"), documented(held[name], meanings, title, INNER if name in ("fit", "diagnosis") else {}))]
+        lines += [
+            "",
+            f"## {title}",
+            "",
+            text,
+            "",
+            *table(("key", "meaning"), documented(held[name], meanings, title, INNER if name in ("fit", "diagnosis") else {})),
+        ]
     lines += [
         "", "## Recordings", "",
         "One file is one run of several settled periods, sampled uniformly. CSV: optional lines `# key: value` (date, frequency_Hz, ...), one header",
