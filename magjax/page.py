@@ -1,5 +1,6 @@
 """What the generated pages of docs/ share: Markdown tables, writing a page, checking that the written one is up to date."""
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -33,10 +34,12 @@ def deliver(name: str, text: str, module: str, arguments=None) -> int:
 
     A file named in the arguments takes the place of the page in docs/.
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    given = [a for a in arguments if a != "--check"]
-    target = Path(given[0]) if given else DOCS / name
-    if "--check" not in arguments:
+    parser = argparse.ArgumentParser(prog=f"python -m {module}", description=f"Writes docs/{name} from the code.")
+    parser.add_argument("target", type=Path, nargs="?", default=DOCS / name, help="another file in its place")
+    parser.add_argument("--check", action="store_true", help="only say whether the file is up to date")
+    given = parser.parse_args(arguments)
+    target = given.target
+    if not given.check:
         target.write_text(text, encoding="utf-8")
         print(target)
         return 0
