@@ -32,6 +32,7 @@ class DensityBasis:
     flat: np.ndarray
     knots_s: int
     knots_r: int
+    held: np.ndarray | None = None  # (size, size), A/m: masses that are there beside them, and stay
 
     @property
     def unknowns(self) -> int:
@@ -161,6 +162,13 @@ def _differences(triples, unknowns, ridge=()):
         row[k] = RIDGE
         rows.append(row)
     return np.stack(rows)
+
+
+def held_basis(hysteresis, total: float) -> DensityBasis:
+    """No unknown at all: the masses of an operator as they are."""
+    masses = np.asarray(hysteresis.masses)
+    none = np.zeros((masses.size, 0))
+    return DensityBasis(float(hysteresis.low), float(hysteresis.high), len(masses), none, (), total, np.zeros(0), 0, 0, masses)
 
 
 def cell_basis(low: float, high: float, total: float, level: int) -> DensityBasis:

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.bench import load_bench
+from magjax.errors import ConfigurationError
 from magjax.simulate import require_x64
 
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
-from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
+from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, masses_held, spectra_of
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
@@ -43,6 +44,7 @@ def fit(
 
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
     of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it, or up to what chi2/N;
+    Masses that `bench.free` does not name are held at those of `actuator`, with its start memory.
     `progress`: called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early;
     `spectra`: those of the recordings, where another fit of the same has them; `start`: a fit whose density and weights are
     gone on from.
@@ -51,6 +53,13 @@ def fit(
     """
     require_x64()
     bench = load_bench(bench)
+    if masses_held(bench):
+        if actuator is None:
+            raise ConfigurationError(
+                "fit.free leaves hysteresis.masses out, and nothing says what they are; give the fitted folder that holds them (--model), "
+                "or name hysteresis.masses in fit.free"
+            )
+        choices = dataclasses.replace(choices, knots=None, rest="held")
     actuator = bench.actuator() if actuator is None else actuator
     begin = time.perf_counter()
     spectra = spectra_of(recordings, bench, choices.harmonics) if spectra is None else spectra
@@ -201,7 +210,11 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
     effective = float(np.trace(cov @ (solution.normal - prior_matrix(problem, solution.weights))))
     chi2n = solution.chi2 / count
     related = correlations(problem, refined)
-    message = outcome(chi2n, per_recording, solution, rows, problem) + valleys(related) + unsettled(problem.spectra)
+    message = (
+        outcome(chi2n, per_recording, solution, rows, problem, choices.max_jacobians)
+        + valleys(related)
+        + unsettled(problem.spectra)
+    )
     return FitResult(
         fitted, bench, bool(solution.converged), message, tuple(rows), related, per_recording, float(chi2n), count,
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
@@ -248,12 +261,15 @@ def unsettled(spectra) -> str:
     return f"; {len(starts)} of {len(spectra)} recordings began unsettled: a decaying motion of up to {max(starts):.2g} m was taken out"
 
 
-def outcome(chi2n, rows, solution, parameters, problem) -> str:
-    """What the fit means, with its remedy."""
+def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
+    """What the fit means, with its remedy. `limit`: the Jacobians that it was given."""
+    if solution.interrupted:
+        return f"interrupted after {solution.jacobians} Jacobians; this is what was reached: give it as --model to go on from its constants"
     if not solution.converged:
-        return (
-            f"stopped after {solution.jacobians} Jacobians before it settled; raise the limit or start nearer (see the bench file)"
-        )
+        after = f"stopped after {solution.jacobians} Jacobians before it settled"
+        if limit is not None and solution.jacobians < limit:
+            return f"{after}: no step leads on from there; start nearer, hold a parameter or give it a prior (see the bench file)"
+        return f"{after}; raise --max-jacobians or start nearer (see the bench file)"
     worst = max(rows, key=lambda r: r.chi2_per_sample)
     bound = [e.name for e in parameters if e.at_bound]
     if bound:

@@ -230,7 +230,7 @@ def solve(
             settled = stalled or decrement < 0.5 + 1e-4 * cost
             if evidence and chi2 / count < FAR:
                 found = evidence_weights(layout, z, normal, weights)
-                moved = np.max(np.abs(np.log(found / weights)))
+                moved = np.max(np.abs(np.log(found / weights)), initial=0.0)
                 weights = weights * np.clip(found / weights, 1 / 30, 30)
                 prior = prior_matrix(problem, weights)
                 cost = 0.5 * (chi2 + z @ prior @ z)

@@ -39,6 +39,7 @@ class Layout(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     log: tuple[bool, ...] = eqx.field(static=True)
     memories: int = eqx.field(static=True, default=0)
+    held: jax.Array | None = None
 
     @staticmethod
     def build(basis, names, starts, scales, log, memories: int = 0) -> "Layout":
@@ -46,6 +47,7 @@ class Layout(eqx.Module):
         return Layout(
             jnp.asarray(basis.cells), tuple(jnp.asarray(D) for D in basis.penalties), jnp.asarray(basis.total),
             jnp.asarray(starts, dtype=float), jnp.asarray(scales, dtype=float), tuple(names), tuple(log), memories,
+            None if basis.held is None else jnp.asarray(basis.held),
         )  # fmt: skip
 
     @property
@@ -105,6 +107,7 @@ class Layout(eqx.Module):
         n = self.density_unknowns
         side = int(round(self.cells.shape[0] ** 0.5))
         masses = (self.total * (self.cells @ z[:n])).reshape(side, side)
+        masses = masses if self.held is None else self.held
         offset = self.total * z[n] + jnp.sum(masses)
         template = eqx.tree_at(lambda a: (a.hysteresis.masses, a.hysteresis.offset), template, (masses, offset))
         values = {name: self.value(name, z) for name in self.names}

@@ -9,7 +9,7 @@ import numpy as np
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.extrema import nesting
 
-from .density import cell_basis, hat_basis
+from .density import cell_basis, hat_basis, held_basis
 from .joint import Problem
 from .model import Layout, Predictor, Target, make_start_actuator
 from .solver import bounded_step
@@ -88,13 +88,26 @@ def free_parameters(bench, actuator, extra=()):
     return tuple(dict.fromkeys(names))
 
 
+def masses_held(bench) -> bool:
+    """Whether the bench leaves the Preisach masses out of what is fitted."""
+    return "hysteresis.masses" not in bench.free
+
+
 def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
     """The problem and its starting vector. `start`: density unknowns and bottom to go on from, left aside where there are not as
     many; else equation error."""
     low, high = applied_range(spectra, actuator)
     margin = PLANE_MARGIN * (high - low)
+    held = masses_held(bench)
     total = float(actuator.magnetostriction.M_s) if actuator.magnetostriction is not None else _total_from(spectra, bench)
-    if choices.knots is None:
+    if held:
+        basis = held_basis(actuator.hysteresis, total)
+        if low < basis.low or high > basis.high:
+            raise ConfigurationError(
+                f"the masses are held on a plane of {basis.low:.5g} .. {basis.high:.5g} A/m and the recordings reach {low:.5g} .. {high:.5g}; "
+                "name hysteresis.masses in fit.free, or leave out the recordings beyond"
+            )
+    elif choices.knots is None:
         basis = cell_basis(low - margin, high + margin, total, choices.level)
     else:
         crowd = 1.7 if bench.drive == "field" else 1.0
@@ -106,11 +119,13 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
     full = [line_deviations(s, s.noise) for s in spectra]
     starter = actuator  # its coil holds all of the eddy loss, for the equation error
-    for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" and start is None else ():
+    for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" and start is None and not held else ():
         # field-driven benches differ by decades: find the scale first
         found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
         actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})
-    if start is None or len(start) != basis.cells.shape[1] + 1:
+    if held:
+        start = np.asarray([(actuator.hysteresis.offset - actuator.hysteresis.masses.sum()) / total])
+    elif start is None or len(start) != basis.cells.shape[1] + 1:
         x, bottom, _ = equation_error_start(basis, spectra, full, starter, jax.jit(bounded_step), rest=rest)
         start = np.append(x, bottom)
     known = actuator.parameters()
@@ -136,7 +151,8 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS[: len(basis.penalties)]), jnp.asarray(priors), jnp.asarray(1e-3),
         jnp.asarray(rows), jnp.asarray(shares),
     )  # fmt: skip
-    problem = Problem(layout, make_start_actuator(actuator, basis, rest), predictors, target, tuple(spectra), _quasistatic(bench))
+    template = actuator if held else make_start_actuator(actuator, basis, rest)
+    problem = Problem(layout, template, predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
 
 

@@ -64,6 +64,37 @@ def test_fit_writes_what_the_interface_promises(folder, capsys):
     assert main(["report", str(out)]) == 0
 
 
+def test_an_interrupted_fit_keeps_what_it_reached(folder, capsys, monkeypatch):
+    import fitting.fit as module
+
+    solve = module.solve
+
+    def interrupted(*arguments, progress=None, **options):
+        def stop(step, chi2):
+            raise KeyboardInterrupt
+
+        return solve(*arguments, progress=stop, **options)
+
+    files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
+    monkeypatch.setattr(module, "solve", interrupted)
+    assert main(["fit", *files, "--bench", "aa-050h", "--out", str(folder / "stopped")]) == 130
+    said = capsys.readouterr().out
+    assert "interrupted after 1 Jacobians" in said and "raise" not in said
+    assert load_model(folder / "stopped")[1].name == "aa-050h"
+
+
+def test_a_refused_fit_leaves_no_empty_folder(folder, capsys, monkeypatch):
+    files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
+    out = folder / "refused"
+    assert main(["fit", *files, str(folder / "none.csv"), "--bench", "aa-050h", "--out", str(out)]) in (2, 3)
+    assert not out.exists()
+    monkeypatch.setattr("fitting.fit.build_problem", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert main(["fit", *files, "--bench", "aa-050h", "--out", str(out)]) == 130 and not out.exists()
+    with pytest.raises(SystemExit):
+        main(["fit", *files, "--bench", "aa-050h", "--cells", "-3"])
+    assert "at least 2 cells" in capsys.readouterr().err
+
+
 def test_sweep_and_convert(folder, capsys):
     assert main(["sweep", "--frequencies", "10,100", "--amplitudes", "0.3,0.6", "--out", str(folder / "sweep.nc"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["points"] == 4

@@ -17,7 +17,7 @@ from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import operator_rows, unfold
 from magjax.bench import load_bench
-from magjax.errors import RecordingError
+from magjax.errors import ConfigurationError, RecordingError
 from magjax.preisach import Preisach
 from magjax.recording import Recording
 
@@ -74,7 +74,25 @@ def test_interrupt_keeps_what_was_reached(recordings, bench):
 
     stopped = fit(recordings, bench, choices=QUICK, progress=stop, refine=False)
     assert not stopped.converged and stopped.jacobians == 3
-    assert np.isfinite(stopped.chi2_per_sample)
+    assert np.isfinite(stopped.chi2_per_sample) and "interrupted after 3" in stopped.message
+
+
+def test_masses_that_are_not_free_are_held(recordings, bench, result):
+    held = dataclasses.replace(bench, free=("coil.R_eddy", "mechanics.xi", "mechanics.f0"))
+    with pytest.raises(ConfigurationError, match="--model"):
+        fit(recordings, held)
+    off = result.actuator.replace({"coil.R_eddy": 80.0, "mechanics.xi": 0.6})
+    again = fit(recordings, held, actuator=off, choices=QUICK)
+    assert again.converged and again.chi2_per_sample < 1.1 * result.chi2_per_sample
+    assert np.array_equal(again.actuator.hysteresis.masses, result.actuator.hysteresis.masses)
+    for name in held.free:
+        assert again.estimate(name).value == pytest.approx(result.estimate(name).value, rel=3e-3)
+        assert again.estimate(name).stderr < 1.05 * result.estimate(name).stderr  # less is unknown
+    beyond = dataclasses.replace(
+        recordings[0], channels={**recordings[0].channels, "current": 2 * recordings[0].channels["current"]}
+    )
+    with pytest.raises(ConfigurationError, match="recordings reach"):
+        fit([beyond], held, actuator=off)
 
 
 def test_one_unknown_a_cell(recordings, bench):

@@ -67,10 +67,13 @@ def main(arguments=None) -> int:
         print(f"magjax {arguments[0]}: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
-        print(f"magjax {arguments[0]}: interrupted; what was done is saved", file=sys.stderr)
+        print(f"magjax {arguments[0]}: interrupted; what was reached is kept", file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0
+    finally:
+        if used := sys.modules.get("magjax.cli.runtime"):
+            used.discard_empty()
 
 
 if __name__ == "__main__":

@@ -38,7 +38,9 @@ def _common(command, text, example, recordings="+"):
     p = parser(command, text, example)
     p.add_argument("recordings", nargs=recordings, help="recordings (CSV, NetCDF, .mat)")
     p.add_argument("--bench", help="bench file (TOML) or a built-in name")
-    p.add_argument("--model", help="start from a fitted result folder")
+    p.add_argument(
+        "--model", help="constants and effects to start from: a fitted result folder (its masses too, where the bench holds them)"
+    )
     p.add_argument("--check", nargs="+", default=[], help="recordings to predict that take no part in the fit")
     p.add_argument("--out", help="folder for the results and the report")
     p.add_argument("--max-jacobians", type=int, default=30, help="limit of the iteration (default 30)")
@@ -62,14 +64,16 @@ def run_fit(arguments) -> int:
     from fitting.setup import Choices, effect_parameters
 
     choices = Choices(max_jacobians=options.max_jacobians)
+    if options.cells is not None and options.cells < 2:
+        p.error(f"--cells {options.cells}: the plane needs at least 2 cells along each threshold, say 25")
     if options.cells:
         choices = Choices(level=options.cells, knots=None, max_jacobians=options.max_jacobians)
     if options.fleet:
-        return run_fleet(options, choices, folder, Progress(options.quiet or options.json))
+        return run_fleet(options, choices, folder, Progress(options.quiet))
     bench, actuator = _bench_and_start(options)
     recordings = load_recordings(options.recordings, bench)
     checks = load_recordings(options.check, bench) if options.check else []
-    with Progress(options.quiet or options.json) as progress:
+    with Progress(options.quiet) as progress:
         result = fit(recordings, bench, actuator=actuator, extra=effect_parameters(actuator), choices=choices, progress=progress)
         (more, text), stopped = ({}, ""), None
         try:
@@ -94,7 +98,7 @@ def run_fit(arguments) -> int:
             print(f"\nresults in {folder} (report.html, fit.json, model.json)")
     if stopped is not None:
         raise stopped
-    return 0 if result.converged else 4
+    return 130 if result.solution.interrupted else 0 if result.converged else 4
 
 
 def run_diagnose(arguments) -> int:
@@ -123,7 +127,7 @@ def run_diagnose(arguments) -> int:
     try:
         recordings = load_recordings(options.recordings, bench)
         checks = load_recordings(options.check, bench) if options.check else []
-        with Progress(options.quiet or options.json) as progress:
+        with Progress(options.quiet) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
                              choices=Choices(max_jacobians=options.max_jacobians), progress=progress, placebo_runs=options.placebo)  # fmt: skip
     except RecordingError as error:
@@ -132,7 +136,7 @@ def run_diagnose(arguments) -> int:
     if folder:
         from fitting.report import write_diagnosis
 
-        with Progress(options.quiet or options.json) as progress:
+        with Progress(options.quiet) as progress:
             write_diagnosis(folder, found, recordings, content, _reproduce("diagnose", arguments), checks, progress)
     if options.json:
         print(json.dumps(content))
@@ -155,7 +159,7 @@ def _diagnose_strain(options, bench, folder) -> int:
     from fitting.strain_law import diagnose_strain, draw_strain, load_curves, strain_verdict
 
     curves = load_curves(options.recordings, bench)
-    with Progress(options.quiet or options.json) as progress:
+    with Progress(options.quiet) as progress:
         progress("laws of magnetostriction, each curve left out in turn")
         content = strain_verdict(curves)
         if folder:
@@ -194,13 +198,13 @@ def run_demo(arguments) -> int:
     if options.paper:
         from fitting.paper import run_paper
 
-        with Progress(options.quiet or options.json):
+        with Progress(options.quiet):
             content = run_paper(folder, options.seed)
         print(json.dumps(content) if options.json else f"{content['message']}\n\nresults in {folder} (paper.html, paper.json)")
         return 0
     from fitting.demo import run_demo as demo
 
-    with Progress(options.quiet or options.json) as progress:
+    with Progress(options.quiet) as progress:
         text, content = demo(folder, options.seed, progress)
     print(json.dumps(content) if options.json else text)
     return 0
@@ -213,7 +217,7 @@ def run_report(arguments) -> int:
     options = p.parse_args(arguments)
     from fitting.report import rebuild
 
-    with Progress(options.quiet or options.json) as progress:
+    with Progress(options.quiet) as progress:
         page = rebuild(Path(options.folder), progress)
     print(json.dumps({"report": str(page)}) if options.json else f"wrote {page}", file=sys.stdout)
     return 0

@@ -47,11 +47,26 @@ def parser(command: str, text: str, example: str) -> Parser:
     return made
 
 
+_made: list[Path] = []  # folders of this run
+
+
+def discard_empty() -> None:
+    """Take away the folders that this run made and left empty: it was refused, or interrupted before anything was reached."""
+    for folder in _made:
+        try:
+            folder.rmdir()
+        except OSError:
+            pass  # holds something, or is gone
+    _made.clear()
+
+
 def output_folder(path) -> Path | None:
     """A folder that can be written, made before the work starts."""
     if path is None:
         return None
     folder = Path(path)
+    if not folder.exists():
+        _made.append(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / ".magjax-write-test"

@@ -68,7 +68,7 @@ def run_simulate(arguments) -> int:
         phase = 2 * np.pi * np.arange(options.samples) / options.samples
         drive = options.offset + options.amplitude * np.sin(phase)
         dt, periodic = 1 / (options.frequency * options.samples), True
-    with Progress(options.quiet or options.json):
+    with Progress(options.quiet):
         signals = simulate(actuator, drive, dt, periodic=periodic)
         data = signals_dataset(signals, bench.name)
     data.to_netcdf(path, engine="h5netcdf")
@@ -108,7 +108,7 @@ def run_sweep(arguments) -> int:
     from magjax.simulate import sweep
 
     grid = [_values(text) for text in (options.frequencies, options.amplitudes, options.offsets)]
-    with Progress(options.quiet or options.json) as progress:
+    with Progress(options.quiet) as progress:
         data = sweep(actuator, *grid, executor=executor, checkpoint=options.checkpoint, progress=progress)
     data.to_netcdf(path, engine="h5netcdf")
     count = int(np.prod(list(data.sizes.values())))
