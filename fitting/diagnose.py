@@ -21,7 +21,7 @@ from .locate import where
 from .placebo import placebo
 from .screen import offset_score
 from .search import SECOND_Z, screened, search
-from .setup import Choices, effect_parameters, spectra_of
+from .setup import Choices, effect_parameters, spectra_of, with_held_masses
 from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
 
 RECORD_Z = 8.0
@@ -53,6 +53,7 @@ def diagnose(
     bench = load_bench(bench)
     say = progress or (lambda *a: None)
     recordings, check = list(recordings), list(check)
+    choices = with_held_masses(choices, bench, actuator)
     if known := known_instruments(recordings, calibration, bench):
         return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
     held = effect_parameters(actuator)

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.bench import load_bench
-from magjax.errors import ConfigurationError
 from magjax.simulate import require_x64
 
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
-from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, masses_held, spectra_of
+from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of, with_held_masses
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
@@ -53,13 +52,7 @@ def fit(
     """
     require_x64()
     bench = load_bench(bench)
-    if masses_held(bench):
-        if actuator is None:
-            raise ConfigurationError(
-                "fit.free leaves hysteresis.masses out, and nothing says what they are; give the fitted folder that holds them (--model), "
-                "or name hysteresis.masses in fit.free"
-            )
-        choices = dataclasses.replace(choices, knots=None, rest="held")
+    choices = with_held_masses(choices, bench, actuator)
     actuator = bench.actuator() if actuator is None else actuator
     begin = time.perf_counter()
     spectra = spectra_of(recordings, bench, choices.harmonics) if spectra is None else spectra

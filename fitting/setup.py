@@ -93,6 +93,18 @@ def masses_held(bench) -> bool:
     return "hysteresis.masses" not in bench.free
 
 
+def with_held_masses(choices: Choices, bench, actuator) -> Choices:
+    """The choices that are left where the masses are held; raises where nothing says what they are."""
+    if not masses_held(bench):
+        return choices
+    if actuator is None:
+        raise ConfigurationError(
+            "fit.free leaves hysteresis.masses out, and nothing says what they are; give the fitted folder that holds them (--model), "
+            "or name hysteresis.masses in fit.free"
+        )
+    return dataclasses.replace(choices, knots=None, rest="held")
+
+
 def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
     """The problem and its starting vector. `start`: density unknowns and bottom to go on from, left aside where there are not as
     many; else equation error."""
