@@ -205,6 +205,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
     related = correlations(problem, refined)
     message = (
         outcome(chi2n, per_recording, solution, rows, problem, choices.max_jacobians)
+        + loose(rows)
         + valleys(related)
         + unsettled(problem.spectra)
     )
@@ -244,6 +245,12 @@ def valleys(found) -> str:
     """The pairs of parameters that these recordings do not tell apart, in words: their priors do, if any."""
     pairs = [f"{' and '.join(pair.split('~'))} (correlation {value:.2f})" for pair, value in found.items() if abs(value) > VALLEY]
     return f"; a valley: only their priors part {', '.join(pairs)}" if pairs else ""
+
+
+def loose(rows) -> str:
+    """The parameters that these recordings do not hold, in words, and why."""
+    found = [f"{e.name} ({e.why})" for e in rows if e.free and not e.identified]
+    return f"; not identified: {', '.join(found)}" if found else ""
 
 
 def unsettled(spectra) -> str:

@@ -28,9 +28,33 @@ class LagTable:
     R_eddy: float
     damping_ratio: float
 
+    def __str__(self):
+        step = np.argmin(np.abs(self.resistances - self.R_eddy))
+        about = float(np.diff(self.resistances)[max(step - 1, 0)])
+        return (
+            f"T&B's recipe (Sec. 2.3) on {len(self.frequencies)} single tones, with this density and f0: R_eddy = {self.R_eddy:.4g} ohm "
+            f"(mesh of {about:.2g} ohm), xi = {self.damping_ratio:.4g} +- {np.sqrt(self.variance.min()):.2g} between frequencies"
+        )
+
     def as_dict(self) -> dict:
         """Plain lists."""
         return {k: (v.tolist() if isinstance(v, np.ndarray) else v) for k, v in dataclasses.asdict(self).items()}
+
+
+SINGLE = 0.05  # of the fundamental, that another line of the drive may reach in a single tone
+MESH = np.geomspace(0.5, 2.0, 29)  # of the fitted R_eddy
+
+
+def recipe_beside(result, recordings) -> LagTable:
+    """The recipe on the single-tone recordings of a fit, with the fitted density and f0, on a mesh about its R_eddy."""
+    if result.bench.output != "displacement" or "coil.R_eddy" not in result.actuator.parameters():
+        raise ConfigurationError("T&B's recipe wants an actuator with R_eddy and mechanics, current in and displacement out")
+    tones = [
+        r
+        for r, s in zip(recordings, result.spectra, strict=True)
+        if np.abs(s.drive[2:]).max(initial=0.0) < SINGLE * np.abs(s.drive[1])
+    ]
+    return lag_recipe(tones, result.actuator, float(result.actuator.coil.R_eddy) * MESH)
 
 
 @eqx.filter_jit

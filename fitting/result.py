@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .uncertainty import visited_cells
+
 
 @dataclasses.dataclass(frozen=True)
 class RecordingFit:
@@ -51,6 +53,12 @@ class FitResult:
         """The estimate of one parameter by name."""
         return next(e for e in self.estimates if e.name == name)
 
+    @property
+    def cells(self) -> dict:
+        """How many cells of the plane some recording switches, and how many there are: masses of the others are not identified."""
+        seen = visited_cells(self.actuator, self.spectra)
+        return {"switched": int(seen.sum()), "all": int(seen.shape[0] * (seen.shape[0] + 1) // 2)}
+
     def __str__(self):
         lines = [f"{'converged' if self.converged else 'NOT CONVERGED'}: {self.message}", ""]
         lines += [f"  {e}" for e in self.estimates if e.free]
@@ -76,11 +84,12 @@ class FitResult:
             "parameters": {
                 e.name: {
                     "value": e.value, "stderr": e.stderr, "unit": e.unit, "meaning": e.meaning, "free": e.free,
-                    "start": e.start, "at_bound": e.at_bound, "identified": e.identified,
+                    "start": e.start, "at_bound": e.at_bound, "identified": e.identified, "why": e.why,
                 }
                 for e in self.estimates
             },
             "correlations": self.correlations,
+            "cells": self.cells,
             "levels": int(self.actuator.hysteresis.cells),
             "chi2_per_sample": self.chi2_per_sample,
             "bic": self.bic,

@@ -16,6 +16,7 @@ from .solver import bounded_step
 from .spectra import HARMONICS, gain_rows, line_deviations, reduce_recording, with_noise
 from .starts import equation_error_start, scan_loss
 from .transients import unsettled_starts
+from .uncertainty import NO_PRIOR
 
 START_WEIGHTS = (1e2, 1e2, 1e2, 1e2)  # one a family of penalties; the last where there is a reversible part
 PLANE_MARGIN = 0.01
@@ -179,7 +180,7 @@ def _prior(bench, name, value, is_log, info):
         return value / deviation if is_log else info.scale / deviation
     if info.shape:  # a shape means nothing while its effect is small: hold it within about a factor of three
         return 1.0 if is_log else 0.5
-    return 1e-2
+    return NO_PRIOR
 
 
 def _total_from(spectra, bench):

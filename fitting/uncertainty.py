@@ -6,6 +6,13 @@ import numpy as np
 
 WIDEN = 1.3  # stated errors are widened by this: the evidence weights take the roughness for granted
 WIDEN_BESIDE = 2.6  # the same beside an effect: its law's form is taken for granted too
+GAUGES = {  # free without a prior beside free masses, and why nothing holds them
+    "coil.H_bias": "the density moved along the plane does the same: give it a prior",
+    "coil.c0": "the density stretched along the plane does the same: give it a prior",
+    "magnetostriction.lambda_s": "the scale of the masses, with R_eddy, does the same: give it a prior",
+    "magnetostriction.M_s": "the scale of the masses, with R_eddy, does the same: give it a prior",
+}
+NO_PRIOR = 1e-2  # in the optimiser's coordinate: what keeps a parameter finite
 UNDERSMOOTH = 0.1  # parameters are quoted with a tenth of the roughness weights
 
 
@@ -22,6 +29,7 @@ class Estimate:
     start: float
     at_bound: bool = False
     identified: bool = True
+    why: str = ""  # it is not identified
 
     def __str__(self):
         if not self.free:
@@ -57,7 +65,10 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
             reach = max(abs(value), info.scale)
             at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach)
             start = float(layout.starts[layout.names.index(name)])
-            rows.append(Estimate(name, value, stderr, info.unit, info.meaning, True, start, at_bound, bool(stderr < 0.5 * reach)))
+            k = layout.names.index(name)
+            alone = name in GAUGES and layout.density_unknowns > 0 and float(problem.target.priors[k]) <= NO_PRIOR
+            why = GAUGES[name] if alone else "" if stderr < 0.5 * reach else "its error is as large as itself"
+            rows.append(Estimate(name, value, stderr, info.unit, info.meaning, True, start, at_bound, not why, why))
         else:
             rows.append(Estimate(name, value, 0.0, info.unit, info.meaning, False, value))
     return rows

@@ -11,7 +11,8 @@ import pytest
 
 from fitting.demo import concealed_actuator, record
 from fitting.density import cell_basis, hat_basis
-from fitting.fit import fit
+from fitting.fit import fit, loose
+from fitting.recipe import recipe_beside
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
@@ -93,6 +94,20 @@ def test_masses_that_are_not_free_are_held(recordings, bench, result):
     )
     with pytest.raises(ConfigurationError, match="recordings reach"):
         fit([beyond], held, actuator=off)
+
+
+def test_a_gauge_is_told_with_what_makes_up_for_it(recordings, bench, result):
+    assert result.estimate("coil.R_eddy").identified and "not identified" not in result.message
+    free = fit(recordings, bench, extra=("coil.H_bias",), choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
+    bias = free.estimate("coil.H_bias")
+    assert not bias.identified and "density moved" in bias.why and "not identified: coil.H_bias" in loose(free.estimates)
+    assert 0.5 < result.cells["switched"] / result.cells["all"] < 1
+
+
+def test_the_papers_recipe_beside_a_fit(recordings, result):
+    table = recipe_beside(result, recordings)
+    assert table.R_eddy == pytest.approx(62, rel=0.05) and table.damping_ratio == pytest.approx(0.81, rel=0.01)
+    assert "R_eddy" in str(table)
 
 
 def test_one_unknown_a_cell(recordings, bench):

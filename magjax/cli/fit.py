@@ -52,6 +52,9 @@ def run_fit(arguments) -> int:
     p = _common("fit", "Joint fit: all Preisach masses with R_eddy, xi and f0 (or what the bench frees) to all recordings.",
                 "magjax fit rec_*.csv --bench aa-050h --out result", "*")  # fmt: skip
     p.add_argument("--cells", type=int, help="fit one unknown a cell at this level instead of a smooth density")
+    p.add_argument(
+        "--recipe", action="store_true", help="beside the fit T&B's own recipe for R_eddy and xi (Sec. 2.3): phase lags over a mesh"
+    )
     add_intervals(p)
     options = p.parse_args(arguments)
     check_intervals(options)
@@ -82,6 +85,13 @@ def run_fit(arguments) -> int:
             stopped = error
         content = result.as_dict() | more
         content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
+        table = None
+        if options.recipe:
+            from fitting.recipe import recipe_beside
+
+            progress("T&B's recipe")
+            table = recipe_beside(result, recordings)
+            content["recipe"] = table.as_dict()
         if folder:
             from fitting.report import write_fit
 
@@ -90,6 +100,8 @@ def run_fit(arguments) -> int:
         print(json.dumps(content))
     else:
         print(result)
+        if table:
+            print(f"\n{table}")
         if text:
             print(f"\n{text}")
         for row in content["check"]:
