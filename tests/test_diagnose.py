@@ -47,14 +47,7 @@ def test_silent_where_nothing_is_missing(bench):
 
 def test_names_a_concealed_sensor_filter(bench):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
-    asked = {
-        "sensor_lag",
-        "amplifier_lag",
-        "transport_delay",
-        "second_mode",
-        "duffing_stiffness",
-        "excess_loss",
-    }  # all of it: the blind suites
+    asked = {"sensor_lag", "amplifier_lag", "transport_delay", "duffing_stiffness"}  # all of it: the blind suites
     others = tuple(e.name for e in CATALOGUE if e.name not in asked)
     found = diagnose(runs, bench, check=checks, choices=Choices(fine=250, without=others))
     assert found.verdict == "attributed"
