@@ -1,5 +1,8 @@
 """The Preisach operator: laws of T&B Theorem 2.1, an independent oracle, surrogates, gradients."""
 
+import functools
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,25 +42,30 @@ def test_agrees_with_the_slow_operator_to_rounding(seed):
     assert np.abs(got - expected).max() < 1e-12 * masses(L, seed).sum()
 
 
+@functools.cache
+def compiled():
+    """M of a field on a plane of level 6, compiled once a length for all examples."""
+    operator = Preisach(masses(6), LOW, HIGH)
+    return jax.jit(lambda field: operator.magnetization(field, corners=16))
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000))
 def test_rate_independence_and_sampling_independence(seed):
-    operator = Preisach(masses(6), LOW, HIGH)
     field = random_field(seed, 12)
     fine = np.concatenate([np.linspace(a, b, 5)[1:] for a, b in zip(field[:-1], field[1:], strict=True)])
-    coarse = np.asarray(operator.magnetization(field, corners=16))[1:]
-    assert np.abs(np.asarray(operator.magnetization(np.concatenate([field[:1], fine]), corners=16))[4::4] - coarse).max() < 1e-12
+    coarse = np.asarray(compiled()(field))[1:]
+    assert np.abs(np.asarray(compiled()(np.concatenate([field[:1], fine])))[4::4] - coarse).max() < 1e-12
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000))
 def test_piecewise_monotone_and_wiping_out(seed):
-    operator = Preisach(masses(6), LOW, HIGH)
     field = random_field(seed, 14)
-    M = np.asarray(operator.magnetization(field, corners=16))
+    M = np.asarray(compiled()(field))
     assert np.all(np.diff(M) * np.sign(np.diff(field)) >= -1e-13)
     # a field beyond all that came before wipes it out
-    after = np.asarray(operator.magnetization(np.append(field, HIGH), corners=16))[-1]
+    after = np.asarray(compiled()(np.append(field, HIGH)))[-1]
     assert after == pytest.approx(masses(6).sum(), abs=1e-12)
 
 
@@ -82,32 +90,72 @@ def test_lipschitz_bound():
     assert np.abs(a - b).max() <= 2 * C * 5.0 * L / L
 
 
-def test_kp_relays_are_plays_and_converge():
-    """The finite-slope grid equals its L plays to rounding, and approaches the exact operator as 1/L^2."""
-    errors = []
-    field = np.concatenate([np.linspace(a, b, 30) for a, b in ((LOW, 1500), (1500, -200), (-200, 900), (900, 100))])
-    exact = np.asarray(Preisach(smooth(160), LOW, HIGH).magnetization(field))
-    for L in (10, 20, 40):
-        errors.append(np.abs(np.asarray(Preisach(smooth(L), LOW, HIGH).magnetization(field, "kp")) - exact).max())
-    assert errors[2] < errors[0] / 8
-    operator = Preisach(smooth(12), LOW, HIGH)
-    got = np.asarray(relay_magnetization(operator, field, "kp"))
-    levels = np.linspace(LOW, HIGH, 13)
-    state, plays = -np.ones((12, 12)), []
-    for v in field:
-        ramp = 2 * np.clip((v - levels[:-1]) / np.diff(levels), 0, 1) - 1
-        for i in range(12):
-            for j in range(12):
-                state[i, j] = min(max(state[i, j], ramp[i]), ramp[j])
-        plays.append((np.tril(smooth(12)) * state).sum())
-    assert got == pytest.approx(np.array(plays), abs=1e-14)
+def play_outputs(radii, field):
+    """Play operators of these radii from negative saturation, each with its own scalar state: (time, radii)."""
+    output, rows = LOW + radii, []
+    for H in field:
+        output = np.maximum(H - radii, np.minimum(H + radii, output))
+        rows.append(output)
+    return np.array(rows)
 
 
-def test_hard_relays_jump_and_converge_as_one_over_L():
-    field = np.concatenate([np.linspace(LOW, 1500, 200), np.linspace(1500, -200, 200)])
-    exact = np.asarray(Preisach(smooth(160), LOW, HIGH).magnetization(field))
-    errors = [np.abs(np.asarray(Preisach(smooth(L), LOW, HIGH).magnetization(field, "hard")) - exact).max() for L in (10, 40)]
-    assert 1.5 < errors[0] / errors[1] < 12
+def one_play_a_diagonal(nu, field):
+    """M from L plays of radius d cells / 2, each read through one ramp, a cell wide, for each cell of its diagonal."""
+    L, width = len(nu), (HIGH - LOW) / len(nu)
+    p, M = play_outputs(0.5 * width * np.arange(L), field), np.zeros(len(field))
+    for d in range(L):
+        for j in range(L - d):
+            middle = LOW + width * (j + 0.5 * d)
+            M += nu[j + d, j] * (2 * np.clip((p[:, d] - middle) / width, 0, 1) - 1)
+    return M
+
+
+def lines_of_plays(nu, field, q):
+    """M of the piecewise-uniform density mu(s, r): exact along s, q plays to half a cell's width of r (midpoints)."""
+    L, width = len(nu), (HIGH - LOW) / len(nu)
+    mu = 2 * nu / width**2 * (1 + np.eye(L))  # over ds dr; half of a diagonal cell lies below alpha = beta
+    dr = 0.5 * width / q
+    radii, levels, M = dr * (np.arange(L * q) + 0.5), LOW + width * np.arange(L + 1), 0.0
+    for r, p in zip(radii, play_outputs(radii, field).T, strict=True):
+        s = np.sort(np.concatenate([levels - r, levels + r]))  # where the line crosses a level of alpha or beta
+        s = s[(s > LOW + r - 1e-9) & (s < HIGH - r + 1e-9)]
+        centre = 0.5 * (s[1:] + s[:-1])
+        cell = [np.clip((x - LOW) // width, 0, L - 1).astype(int) for x in (centre + r, centre - r)]
+        below = np.concatenate([[0.0], np.cumsum(mu[*cell] * np.diff(s))])
+        M = M + dr * (2 * np.interp(p, s, below) - below[-1])
+    return M
+
+
+def order(sizes, errors):
+    """The exponent of errors that fall as a power."""
+    return -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+
+
+@pytest.mark.parametrize("L", [5, 12])
+def test_kp_relays_are_plays(L):
+    """The L x L relays of finite slope are L play operators to rounding."""
+    field, nu = random_field(9), masses(L, 3)
+    got = np.asarray(relay_magnetization(Preisach(nu, LOW, HIGH), field, "kp"))
+    assert np.abs(got - one_play_a_diagonal(nu, field)).max() < 2e-15 * nu.sum()
+
+
+@pytest.mark.parametrize("L", [5, 9])
+def test_plays_approach_the_exact_operator_as_their_number_squared(L):
+    field, nu, lines = random_field(L), masses(L, L), (2, 4, 8, 16, 32)
+    exact = np.asarray(Preisach(nu, LOW, HIGH).magnetization(field, corners=40))
+    errors = [np.abs(lines_of_plays(nu, field, q) - exact).max() / nu.sum() for q in lines]
+    assert 1.7 < order(lines, errors) < 2.3
+    assert np.all(errors * np.square(lines) < 0.15)
+
+
+def test_relay_grids_approach_the_exact_operator():
+    """Point relays jump, and their error falls as 1/L; the finite slope brings 1/L^2."""
+    field = np.concatenate([np.linspace(a, b, 100) for a, b in ((LOW, 1500), (1500, -200), (-200, 900), (900, 100))])
+    exact, levels = np.asarray(Preisach(smooth(160), LOW, HIGH).magnetization(field)), (10, 20, 40, 80)
+    for surrogate, power, scale in (("hard", 1, 2.5), ("kp", 2, 3.0)):
+        errors = [np.abs(Preisach(smooth(L), LOW, HIGH).magnetization(field, surrogate) - exact).max() for L in levels]
+        assert power - 0.2 < order(levels, errors) < power + 0.2
+        assert np.all(errors * np.power(levels, power) < scale)
 
 
 def test_start_states():
@@ -131,13 +179,11 @@ def test_gradients_equal_differences():
     field = jnp.asarray(random_field(5, 30))
     base = smooth(8)
 
+    operator = Preisach(base, LOW, HIGH)
+
+    @jax.jit
     def mean_square(m, shift):
-        return jnp.sum(Preisach(base, LOW, HIGH).__class__.magnetization(_with(m), field + shift, corners=20) ** 2)
-
-    def _with(m):
-        import equinox as eqx
-
-        return eqx.tree_at(lambda o: o.masses, Preisach(base, LOW, HIGH), m)
+        return jnp.sum(eqx.tree_at(lambda o: o.masses, operator, m).magnetization(field + shift, corners=20) ** 2)
 
     grad_m, grad_shift = jax.grad(mean_square, argnums=(0, 1))(jnp.asarray(base), 1.234)
     step = 1e-6
@@ -146,8 +192,8 @@ def test_gradients_equal_differences():
         change[i, j] = step
         number = (mean_square(jnp.asarray(base + change), 1.234) - mean_square(jnp.asarray(base - change), 1.234)) / (2 * step)
         assert float(grad_m[i, j]) == pytest.approx(float(number), rel=1e-7, abs=1e-9)
-    number = (mean_square(jnp.asarray(base), 1.234 + 1e-4) - mean_square(jnp.asarray(base), 1.234 - 1e-4)) / 2e-4
-    assert float(grad_shift) == pytest.approx(float(number), rel=1e-6)
+    number = (mean_square(jnp.asarray(base), 1.234 + 1e-3) - mean_square(jnp.asarray(base), 1.234 - 1e-3)) / 2e-3
+    assert float(grad_shift) == pytest.approx(float(number), rel=1e-7)
 
 
 def test_lost_corner_is_told():
