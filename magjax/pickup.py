@@ -13,10 +13,15 @@ MOST_HARMONICS = 40
 MOST_MISSING = 0.1  # of the samples
 
 
-def _design(phases, orders):
-    """Constant, cosines and sines at phases (cycles): (samples, 1 + 2 orders)."""
+def _harmonics(phases, orders):
+    """Cosines and sines at phases (cycles): (samples, 2 orders)."""
     angle = 2 * np.pi * np.outer(phases, np.arange(1, orders + 1))
-    return np.concatenate([np.ones((len(phases), 1)), np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _design(phases, orders):
+    """Constant and harmonics at phases (cycles): (samples, 1 + 2 orders)."""
+    return np.concatenate([np.ones((len(phases), 1)), _harmonics(phases, orders)], axis=1)
 
 
 def _orders(phases, per_period):
@@ -102,8 +107,12 @@ def merge_captures(captures, bench, path):
         phases.append(f * dt * index - np.arctan2(b, a) / (2 * np.pi))
     together = np.concatenate(phases)
     orders = _orders(together, per)
-    design = _design(together, orders)
-    models = {q: np.linalg.lstsq(design, np.concatenate([c[q] for _, _, c in grids]), rcond=None)[0] for q in grids[0][2]}
+    # a level for each capture: offsets that differ must not lean on the harmonics
+    levels = np.repeat(np.eye(len(phases)), [len(phase) for phase in phases], axis=0)
+    design = np.concatenate([levels, _harmonics(together, orders)], axis=1)
+    models = {
+        q: np.linalg.lstsq(design, np.concatenate([c[q] for _, _, c in grids]), rcond=None)[0][len(phases) :] for q in grids[0][2]
+    }
     merged, filled = {q: [] for q in models}, 0
     for (dt, index, channels), phase in zip(grids, phases, strict=True):
         full = np.arange(index[-1] + 1)
@@ -112,7 +121,7 @@ def merge_captures(captures, bench, path):
         start = (-phase[0]) % 1.0 / (f * dt)
         whole = int(np.floor((full[-1] - start) * f * dt))
         at = start + np.arange(whole * per) / (per * f * dt)
-        known, lacking = _design(phase, orders), _design(phase[0] + f * dt * wanted, orders)
+        known, lacking = _harmonics(phase, orders), _harmonics(phase[0] + f * dt * wanted, orders)
         for q, values in channels.items():
             level = float(np.mean(values - known @ models[q]))
             record = _fill(full, index, wanted, values, lacking @ models[q] + level)
@@ -148,8 +157,7 @@ def integrate_emf(emf, drive, dt, column):
     rest = _trapezoids(rate - design @ coefficients, dt)
     last = min(whole, n - 1)
     rest = rest - rest[last] / last * np.arange(n)
-    B = B + rest
-    return B - B[:whole].mean()
+    return B + rest - rest[:whole].mean()  # the harmonics have none, and `whole` samples are periods but for a rounding
 
 
 def _trapezoids(rate, dt):
