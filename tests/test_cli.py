@@ -1,16 +1,20 @@
 """Commands as a user runs them: files, exit statuses, one-line errors with the mend, nothing half written."""
 
+import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 
+import fitting.fit
+import fitting.paper
 from fitting.demo import concealed_actuator, record
+from fitting.fit import fit
 from magjax.bench import load_bench
 from magjax.cli import COMMANDS, main
 from magjax.model_file import load_model
 from magjax.recording import load_recordings
-from magjax.simulate import simulate
 from magjax.writers import write_recording
 
 
@@ -24,9 +28,11 @@ def folder(tmp_path_factory):
     return path
 
 
-def test_fit_writes_what_the_interface_promises(folder, capsys):
+def test_fit_writes_what_the_interface_promises(folder, capsys, monkeypatch):
     out = folder / "result"
     files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
+    returned = []
+    monkeypatch.setattr(fitting.fit, "fit", lambda *a, **k: returned.append(fit(*a, **k)) or returned[-1])
     assert main(["fit", *files, "--bench", "aa-050h", "--out", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     content = json.loads((out / "fit.json").read_text())
@@ -51,12 +57,12 @@ def test_fit_writes_what_the_interface_promises(folder, capsys):
         "http://purl.org", ""
     ).replace("http://creativecommons.org", "")
     assert len(page) < 1_500_000 and 'aria-label="' in page
-    # the model simulates again, bit for bit
+    # model.json is the actuator that the fit returned, bit for bit
     actuator, bench = load_model(out)
-    again, _ = load_model(out)
-    drive = 0.1 + 0.5 * np.sin(2 * np.pi * np.arange(200) / 200)
-    a, b = (np.asarray(simulate(x, drive, 1e-4, periodic=True).reading) for x in (actuator, again))
-    assert np.array_equal(a, b) and bench.name == "aa-050h"
+    (fitted,) = returned
+    (now, shape), (then, expected) = jax.tree.flatten(actuator), jax.tree.flatten(fitted.actuator)
+    assert shape == expected and all(np.array_equal(a, b) for a, b in zip(now, then, strict=True))
+    assert dataclasses.replace(bench, source="") == dataclasses.replace(fitted.bench, source="")
     assert (
         main(["simulate", "--model", str(out), "--frequency", "50", "--amplitude", "0.5", "--out", str(folder / "s.nc"), "--quiet"])
         == 0
@@ -189,6 +195,9 @@ def test_wrong_use(tmp_path, capsys):
     blocked.write_text("")
     assert main(["sweep", "--out", str(blocked / "x" / "y.nc"), "--quiet"]) == 2
     assert "cannot be written" in capsys.readouterr().err
+    assert main(["fit", str(tmp_path / "rec.csv"), "--bench", "aa-050h", "--out", str(blocked / "below"), "--quiet"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert f"{blocked / 'below'}: cannot be written" in error and "--out" in error and "\n" not in error
     assert main(["simulate", "--amplitude", "9", "--out", str(tmp_path / "s.nc"), "--quiet"]) == 2
     assert "outside the Preisach plane" in capsys.readouterr().err
 
@@ -200,3 +209,25 @@ def test_every_command_explains_itself(command, capsys):
     except SystemExit as stop:
         assert stop.code == 0
     assert "example: magjax" in capsys.readouterr().out
+
+
+def test_the_papers_loops_and_recipe(tmp_path, capsys, monkeypatch):
+    """`demo --paper` on fewer frequencies and a coarser mesh: its page, its pictures and its numbers say the same."""
+    monkeypatch.setattr(fitting.paper, "FREQUENCIES", (20, 100, 200))
+    monkeypatch.setattr(fitting.paper, "MESH", np.array([50.0, 70.0, 90.0]))
+    assert main(["demo", "--paper", "--out", str(tmp_path), "--quiet"]) == 0
+    assert "R_eddy = 70 ohm" in capsys.readouterr().out
+    recipe = json.loads((tmp_path / "paper.json").read_text())["recipe"]
+    assert recipe["R_eddy"] == 70 and recipe["damping_ratio"] == pytest.approx(0.7783, abs=3e-3)
+    assert recipe["frequencies"] == pytest.approx([20, 100, 200]) and np.shape(recipe["xi"]) == (3, 3)
+    page = (tmp_path / "paper.html").read_text()
+    for R, row in zip(recipe["resistances"], recipe["xi"], strict=True):
+        cells = f">{R:g}</th>" + "".join(f"<td>{x:.4f}</td>" for x in row)
+        assert cells in "".join(line.strip() for line in page.splitlines())
+    for name, curves, words in (
+        ("paper_loops", 6, ("[-0.7, 0.9] A", "[-0.7, 0.3] A", "20 Hz", "200 Hz", "displacement")),
+        ("lag_table", 3, ("50 ohm", "70 ohm", "damping ratio")),
+    ):
+        drawn = (tmp_path / "figures" / f"{name}.svg").read_text()
+        assert drawn.count("clip-path=") >= curves and all(f">{word}" in drawn for word in words), name
+    assert page.count("<svg") == 2
