@@ -114,6 +114,7 @@ def tan_baras_density(cells: int = 25, low: float = 0.0, high: float = 2.6e4, to
 def from_bench(bench) -> Actuator:
     """The actuator that a bench file describes, with a starting density on the plane that its limits can reach."""
     constants = bench.constants
+    _check_bench(bench)
 
     def block(kind, prefix):
         names = parameters_of(kind)
@@ -134,10 +135,26 @@ def from_bench(bench) -> Actuator:
     )
 
 
+def _check_bench(bench):
+    """What a bench file alone does not tell: whether there is a coil to drive, and which effects its priors speak of."""
+    from .effects import CATALOGUE
+
+    if not any(name.startswith("coil.") for name in bench.constants):
+        raise ConfigurationError(
+            f"bench {bench.source or bench.name}: has no [coil], so nothing to drive; state one (see docs/parameters.md)"
+        )
+    known = {f"effects.{e.name}.{p}" for e in CATALOGUE for p in e.parameters()}
+    for name in bench.priors:
+        if name.startswith("effects.") and name not in known:
+            raise ConfigurationError(
+                f'bench {bench.source or bench.name}: fit.priors names "{name}", which no effect has (see docs/parameters.md)'
+            )
+
+
 def _plane(bench, coil):
     """Range of the Preisach plane, A/m: what the current (field) limit reaches on either side of the bias."""
-    limit = dict(bench.limits or {})
-    largest = float(limit.get("current_A", limit.get("field_A_per_m", 0.9 if bench.drive == "current" else 300.0)))
+    key, usual = ("current_A", 0.9) if bench.drive == "current" else ("field_A_per_m", 300.0)
+    largest = float(bench.limits.get(key, usual))
     ends = [float(coil.applied_field(jnp.asarray(sign * largest))) for sign in (-1, 1)]
     margin = 0.01 * (ends[1] - ends[0])
     return ends[0] - margin, ends[1] + margin

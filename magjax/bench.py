@@ -6,6 +6,7 @@ k_eddy is driven by a known field and ends at flux density. With output = "strai
 
 import dataclasses
 import difflib
+import math
 import tomllib
 from pathlib import Path
 
@@ -23,20 +24,28 @@ OTHER_KEYS = {
     "limits": ("current_A", "field_A_per_m"),
     "fit": ("free", "output", "priors"),
 }
-COLUMN_KEYS = (
-    "name",
-    "scale",
-    "offset",
-    "unit",
-    "split",
-    "merge",
-    "quasistatic",
-    "emf_turns",
-    "emf_area",
-    "emf_sign",
-    "bits",
-    "gain_accuracy",
-)
+NEEDED = {  # what a block that is there must state: a constant of another bench would pass for this one's
+    "coil": ("R_eddy", "c0", "H_bias", "N_m", "A_m"),
+    "magnetostriction": BLOCK_KEYS["magnetostriction"],
+    "mechanics": BLOCK_KEYS["mechanics"],
+}
+SIGNED = ("H_bias", "offset")
+MAY_BE_ZERO = (*SIGNED, "k_eddy", "xi", "order2")
+COLUMN_KEYS = {  # key -> what it must be
+    "name": str,
+    "scale": float,
+    "offset": float,
+    "unit": str,
+    "split": str,
+    "merge": bool,
+    "quasistatic": bool,
+    "emf_turns": float,
+    "emf_area": float,
+    "emf_sign": float,
+    "bits": float,
+    "gain_accuracy": float,
+}
+LARGEST = {"bits": 32, "gain_accuracy": 0.5}  # of those column keys that lie above zero and are bounded
 QUANTITIES = (
     "time",
     "current",
@@ -51,12 +60,14 @@ QUANTITIES = (
     "strain",
     "stress",
 )
+OUTPUTS = ("displacement", "flux_density", "magnetization", "strain")
 STARTS = ("auto", "demagnetized", "negative_saturation", "positive_saturation")
 
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """What stands on the bench. `constants`: "block.parameter" -> SI; `columns`: quantity -> how a file names it."""
+    """What stands on the bench. `constants`: "block.parameter" -> SI; `columns`: quantity -> how a file names it;
+    `start`: the state before the drive by name, or the fields, A/m, that led to it from negative saturation, oldest first."""
 
     name: str
     blocks: tuple[str, ...]
@@ -66,7 +77,7 @@ class Bench:
     columns: dict
     free: tuple[str, ...]
     levels: int
-    start: str
+    start: str | tuple[float, ...]
     limits: dict
     priors: dict
     source: str = ""
@@ -92,7 +103,9 @@ def load_bench(bench) -> Bench:
         return bench
     path = built_in_benches().get(str(bench), Path(str(bench)))
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"bench {path}: not text in UTF-8 (byte {error.start + 1}); save it again as UTF-8") from None
     except OSError as error:
         names = ", ".join(built_in_benches())
         raise ConfigurationError(f"bench {bench}: {error.strerror or error}; give a TOML file or one of {names}") from None
@@ -113,72 +126,182 @@ def _check_keys(content, path):
     for key, value in content.items():
         if key == "name":
             continue
-        if key == "columns":
-            for quantity, column in value.items():
-                if quantity not in QUANTITIES:
-                    raise ConfigurationError(f"bench {path}: [columns.{quantity}] is unknown{_suggest(quantity, QUANTITIES)}")
-                for inner in column:
-                    if inner not in COLUMN_KEYS:
-                        raise ConfigurationError(
-                            f"bench {path}: columns.{quantity}.{inner} is unknown{_suggest(inner, COLUMN_KEYS)}"
-                        )
-            continue
-        if key not in sections:
+        if key not in sections and key != "columns":
             raise ConfigurationError(f"bench {path}: [{key}] is unknown{_suggest(key, (*sections, 'columns', 'name'))}")
         if not isinstance(value, dict):
-            raise ConfigurationError(f"bench {path}: {key} must be a section, written [{key}]")
+            wanted = "[columns.QUANTITY], for instance [columns.displacement]" if key == "columns" else f"[{key}]"
+            raise ConfigurationError(f"bench {path}: {key} = {value!r} must be a section, written {wanted}")
         for inner in value:
-            if inner not in sections[key]:
+            if key == "columns" and inner not in QUANTITIES:
+                raise ConfigurationError(f"bench {path}: [columns.{inner}] is unknown{_suggest(inner, QUANTITIES)}")
+            if key != "columns" and inner not in sections[key]:
                 raise ConfigurationError(f"bench {path}: {key}.{inner} is unknown{_suggest(inner, sections[key])}")
+
+
+def _number(value, where, path) -> float:
+    """A finite number, or the error that names `where` it stands."""
+    finite = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < math.inf  # NaN is not below
+    if not finite:
+        raise ConfigurationError(f"bench {path}: {where} = {value!r} must be a finite number, for instance {where} = 1.5")
+    return float(value)
+
+
+def _positive(value, where, path) -> float:
+    if not _number(value, where, path) > 0:
+        raise ConfigurationError(f"bench {path}: {where} = {value}; give a positive value")
+    return float(value)
+
+
+def _constants(content, path) -> dict:
+    """ "block.parameter" -> SI, of the blocks that the file holds."""
+    constants = {}
+    for block, keys in BLOCK_KEYS.items():
+        for key in (k for k in keys if k in content.get(block, {})):
+            value = _number(content[block][key], f"{block}.{key}", path)
+            if value < 0 and key not in SIGNED:
+                raise ConfigurationError(f"bench {path}: {block}.{key} = {value:g} is negative; give a value of zero or more")
+            if value == 0 and key not in MAY_BE_ZERO:
+                raise ConfigurationError(f"bench {path}: {block}.{key} = 0; give a positive value")
+            constants[f"{block}.{key}"] = value
+    return constants
+
+
+def _check_blocks(content, path):
+    """What is stated is whole: nothing is filled up with the constants of another bench, nothing stands idle."""
+    coil = content.get("coil", {})
+    if "k_eddy" in coil:
+        idle = [k for k in NEEDED["coil"] if k in coil and k != "H_bias"]
+        if idle:
+            raise ConfigurationError(
+                f"bench {path}: coil.{idle[0]} does nothing beside coil.k_eddy, which says that the drive is a known field; take one away"
+            )
+    for block, keys in NEEDED.items():
+        missing = [k for k in keys if block in content and k not in content[block]]
+        if missing and not (block == "coil" and "k_eddy" in coil):
+            raise ConfigurationError(
+                f"bench {path}: [{block}] lacks {', '.join(missing)}; state it, as in {missing[0]} = 1.5 (one that is fitted starts there)"
+            )
+    if "mechanics" in content and "magnetostriction" not in content:
+        raise ConfigurationError(f"bench {path}: [mechanics] without [magnetostriction], which drives it; add that block")
+    sensor = content.get("sensor", {})
+    if "order2" in sensor and "tau" not in sensor:
+        raise ConfigurationError(f"bench {path}: sensor.order2 without sensor.tau; state the filter's tau in s beside it")
+
+
+def _columns(content, path) -> dict:
+    """[columns] as it stands, every key of the kind that readers expect."""
+    columns = content.get("columns", {})
+    words = {str: 'text, written in quotes ("...")', bool: "true or false"}
+    for quantity, column in columns.items():
+        where = f"columns.{quantity}"
+        if not isinstance(column, dict):
+            raise ConfigurationError(f'bench {path}: {where} = {column!r} must be a section: [{where}] with name = "..." under it')
+        for key, value in column.items():
+            if key not in COLUMN_KEYS:
+                raise ConfigurationError(f"bench {path}: {where}.{key} is unknown{_suggest(key, tuple(COLUMN_KEYS))}")
+            if COLUMN_KEYS[key] is not float and not isinstance(value, COLUMN_KEYS[key]):
+                raise ConfigurationError(f"bench {path}: {where}.{key} = {value!r} must be {words[COLUMN_KEYS[key]]}")
+            if key in LARGEST and not (type(value) in (int, float) and 0 < value <= LARGEST[key]):
+                raise ConfigurationError(f"bench {path}: {where}.{key} = {value!r}; give a number above 0 and up to {LARGEST[key]}")
+            if COLUMN_KEYS[key] is float:
+                (_positive if key in ("emf_turns", "emf_area") else _number)(value, f"{where}.{key}", path)
+        if column.get("scale", 1) == 0:
+            raise ConfigurationError(f"bench {path}: {where}.scale = 0 leaves nothing of the column; give reading over column")
+        if column.get("emf_sign", 1) not in (-1, 1):
+            raise ConfigurationError(f"bench {path}: {where}.emf_sign = {column['emf_sign']}; give 1 or -1")
+        emf = {"emf_turns", "emf_area"}
+        if any(k.startswith("emf_") for k in column) and not emf <= set(column):
+            raise ConfigurationError(
+                f"bench {path}: [{where}] has no {sorted(emf - set(column))[0]}; a pick-up coil needs both emf_turns and emf_area (m^2)"
+            )
+    return columns
+
+
+def _limits(content, path, drive) -> dict:
+    limits = content.get("limits", {})
+    for key, value in limits.items():
+        _positive(value, f"limits.{key}", path)
+    if drive == "current" and "field_A_per_m" in limits and "current_A" not in limits:
+        raise ConfigurationError(f"bench {path}: limits.field_A_per_m bounds a bench driven by a field; give limits.current_A")
+    return limits
+
+
+def _start(content, path):
+    """hysteresis.start: a name, or the fields that led there."""
+    start = content.get("hysteresis", {}).get("start", "auto")
+    if isinstance(start, list):
+        return tuple(_number(v, f"hysteresis.start[{k}]", path) for k, v in enumerate(start))
+    if start not in STARTS:
+        raise ConfigurationError(
+            f"bench {path}: hysteresis.start = {start!r} is unknown{_suggest(str(start), STARTS)}, or a list of fields in A/m"
+        )
+    return start
+
+
+def _fit(content, path, present, drive):
+    """(free, output, priors) of [fit]."""
+    fit = content.get("fit", {})
+    lag = "coil.k_eddy" if drive == "field" else "coil.R_eddy"
+    free = fit.get("free", ["hysteresis.masses", lag, *(("mechanics.xi", "mechanics.f0") if "mechanics" in present else ())])
+    if not isinstance(free, list):
+        written = f'["{free}"]' if isinstance(free, str) else '["coil.R_eddy"]'
+        raise ConfigurationError(f"bench {path}: fit.free = {free!r} must be a list; write free = {written}")
+    known = ("hysteresis.masses", *(f"{b}.{k}" for b, ks in BLOCK_KEYS.items() for k in ks))
+    for name in free:
+        if name not in known:
+            raise ConfigurationError(f'bench {path}: fit.free names "{name}"{_suggest(str(name), known)}')
+    output = fit.get("output", "displacement" if "magnetostriction" in present else "flux_density")
+    if output not in OUTPUTS:
+        raise ConfigurationError(f"bench {path}: fit.output = {output!r} is unknown{_suggest(str(output), OUTPUTS)}")
+    if output == "displacement" and "magnetostriction" not in present:
+        raise ConfigurationError(
+            f'bench {path}: fit.output = "displacement" needs [magnetostriction]; add it or write "flux_density"'
+        )
+    return tuple(free), output, _priors(fit, path)
+
+
+def _priors(fit, path) -> dict:
+    """fit.priors: full name -> standard deviation, SI. The parameters of effects are known to the actuator (`from_bench`)."""
+    stated = fit.get("priors", {})
+    if not isinstance(stated, dict):
+        raise ConfigurationError(f'bench {path}: fit.priors = {stated!r} must be a section: [fit.priors] with "coil.R_eddy" = 2.0')
+    known = tuple(f"{b}.{k}" for b, ks in BLOCK_KEYS.items() for k in ks)
+    priors = dict(_by_full_name(stated))
+    for name, value in priors.items():
+        if name not in known and not (name.startswith("effects.") and name.count(".") == 2):
+            raise ConfigurationError(f'bench {path}: fit.priors names "{name}"{_suggest(name, known)}')
+        priors[name] = _positive(value, f'fit.priors."{name}"', path)
+    return priors
+
+
+def _by_full_name(table, prefix=""):
+    """TOML takes coil.R_eddy = 2.0, written without quotes, for a table in a table."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _by_full_name(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def _build(content, path) -> Bench:
     _check_keys(content, path)
-    constants = {}
-    for block, keys in BLOCK_KEYS.items():
-        for key in keys:
-            if key in content.get(block, {}):
-                value = content[block][key]
-                if isinstance(value, bool) or not isinstance(value, (int, float)):
-                    raise ConfigurationError(f"bench {path}: {block}.{key} = {value!r} must be a number")
-                if value < 0 and key not in ("H_bias", "offset"):
-                    raise ConfigurationError(f"bench {path}: {block}.{key} = {value} is negative; give a value of zero or more")
-                if value == 0 and key not in ("H_bias", "offset", "k_eddy", "xi", "order2"):
-                    raise ConfigurationError(f"bench {path}: {block}.{key} = 0; give a positive value")
-                constants[f"{block}.{key}"] = float(value)
+    name = content.get("name", path.stem)
+    if not isinstance(name, str):
+        raise ConfigurationError(f'bench {path}: name = {name!r} must be text; write name = "{name}"')
+    constants = _constants(content, path)
     drive = "field" if "coil.k_eddy" in constants else "current"
     present = tuple(
         b for b in ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sensor")
         if b in ("source", "coil", "hysteresis", "sensor") or b in content
     )  # fmt: skip
-    fit = content.get("fit", {})
-    output = fit.get("output", "displacement" if "magnetostriction" in present else "flux_density")
-    lag = "coil.k_eddy" if drive == "field" else "coil.R_eddy"
-    free = tuple(fit.get("free", ("hysteresis.masses", lag, *(("mechanics.xi", "mechanics.f0") if "mechanics" in present else ()))))
-    hysteresis = content.get("hysteresis", {})
-    levels, start = hysteresis.get("levels", 25), hysteresis.get("start", "auto")
+    free, output, priors = _fit(content, path, present, drive)
+    levels = content.get("hysteresis", {}).get("levels", 25)
     if not isinstance(levels, int) or not 2 <= levels <= 400:
         raise ConfigurationError(f"bench {path}: hysteresis.levels = {levels!r}; give a whole number from 2 to 400")
-    if start not in STARTS:
-        raise ConfigurationError(f'bench {path}: hysteresis.start = "{start}" is unknown{_suggest(str(start), STARTS)}')
-    known_free = ("hysteresis.masses", "sensor.offset", *(f"{b}.{k}" for b, ks in BLOCK_KEYS.items() for k in ks))
-    for name in free:
-        if name not in known_free:
-            raise ConfigurationError(f'bench {path}: fit.free names "{name}"{_suggest(str(name), known_free)}')
-    for quantity, column in content.get("columns", {}).items():
-        for key, top in (("bits", 32), ("gain_accuracy", 0.5)):
-            value = column.get(key, 1)
-            if key in column and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= top):
-                raise ConfigurationError(
-                    f"bench {path}: columns.{quantity}.{key} = {value!r}; give a number above 0 and up to {top}"
-                )
-    priors = {str(k): float(v) for k, v in fit.get("priors", {}).items()}
-    if "sensor.order2" in constants and "sensor.tau" not in constants:
-        raise ConfigurationError(f"bench {path}: sensor.order2 without sensor.tau; state the filter's tau in s beside it")
+    start = _start(content, path)
+    columns, limits = _columns(content, path), _limits(content, path, drive)
+    _check_blocks(content, path)
     if "sensor.tau" in constants:
         for key, least in (("tau", 1e-9), ("order2", 1e-3)):
             priors.setdefault(f"effects.sensor_lag.{key}", max(KNOWN_TO * constants.get(f"sensor.{key}", 0.0), least))
-    return Bench(
-        content.get("name", path.stem), present, constants, drive, output, content.get("columns", {}), free,
-        levels, start, content.get("limits", {}), priors, str(path),
-    )  # fmt: skip
+    return Bench(name, present, constants, drive, output, columns, free, levels, start, limits, priors, str(path))

@@ -13,19 +13,28 @@ from .preisach import Preisach
 
 
 def load_model(folder):
-    """(actuator, bench) from a result folder or its model.json."""
-    from .effects import CATALOGUE
-    from .effects.learned_term import LearnedTerm
-
+    """(actuator, bench) from a result folder or its model.json; raises `ConfigurationError` naming the file and what is wrong."""
     path = Path(folder)
     path = path / "model.json" if path.is_dir() else path
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return _model(json.loads(path.read_text(encoding="utf-8")))
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{path}: {error}; mend it there, or fit again") from None
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ConfigurationError(f"{path}: not a fitted model ({error}); give the folder that magjax fit wrote") from None
+    except KeyError as error:
+        raise ConfigurationError(f"{path}: not a fitted model (no {error}); give the folder that magjax fit wrote") from None
+
+
+def _model(content):
+    from .effects import CATALOGUE
+    from .effects.learned_term import LearnedTerm
+
     stated = dict(content["bench"])
     for key in ("blocks", "free"):
         stated[key] = tuple(stated[key])
+    if isinstance(stated["start"], list):
+        stated["start"] = tuple(stated["start"])
     bench = Bench(**stated)
     actuator = bench.actuator()
     plane = content["hysteresis"]

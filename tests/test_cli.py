@@ -175,10 +175,11 @@ def test_bad_recordings_say_the_mend_in_one_line(tmp_path, capsys, kind, words):
         ("[coil\n", "TOML"),
         ("[hysteresis]\nlevels = 'x'\n", "levels"),
         ("[fit]\nfree = ['coil.Reddy']\n", "R_eddy"),
+        (b"# R\xe9sistance\n", "UTF-8"),
     ],
 )
 def test_bad_bench_files_say_the_mend(tmp_path, capsys, text, words):
-    (tmp_path / "bench.toml").write_text(text)
+    (tmp_path / "bench.toml").write_bytes(text if isinstance(text, bytes) else text.encode())
     path = write(tmp_path / "rec.csv", good_rows())
     assert main(["fit", path, "--bench", str(tmp_path / "bench.toml"), "--quiet"]) == 2
     error = capsys.readouterr().err.strip()

@@ -35,12 +35,14 @@ SETTINGS = {
     "sensor.tau": "filter of the sensor, if it is known (data sheet, calibration): 1/(1 + s tau + order2 (s tau)^2), s; part of the base, not searched for",
     "sensor.order2": "of that filter: 0 first order (default), 1/3 Bessel, 1/2 Butterworth",
     "hysteresis.levels": "levels L of the Preisach plane that `simulate` starts from, 2 to 400 (default 25)",
-    "hysteresis.start": "magnetic state before a simulation: " + ", ".join(f'"{s}"' for s in bench.STARTS) + ' (default "auto")',
-    "limits.current_A": "largest current, A: bounds the Preisach plane, what `record` may drive and what is asked for next",
-    "limits.field_A_per_m": "the same for a bench that is driven by a field, A/m",
+    "hysteresis.start": "magnetic state before a simulation: "
+    + ", ".join(f'"{s}"' for s in bench.STARTS)
+    + ' (default "auto", which is "negative_saturation"; a fit tries the three), or a list of the fields, A/m, that led there from negative saturation, oldest first',
+    "limits.current_A": "largest current, A: bounds the Preisach plane of `simulate` (by 0.9 where none is stated), what `record` may drive and what is asked for next",
+    "limits.field_A_per_m": "the same for a bench that is driven by a field, A/m (300 where none is stated)",
     "fit.free": 'what a fit frees: "hysteresis.masses" and any "block.parameter" of the tables above',
     "fit.output": "the measured quantity that is fitted (default: displacement, or flux_density without [magnetostriction])",
-    "fit.priors": "standard deviation of a free parameter about its stated value, SI, by its full name",
+    "fit.priors": "standard deviation of a free parameter about its stated value, SI, above zero, by its full name, as in `coil.R_eddy = 2.0`",
 }
 COLUMNS = {
     "name": "name of the column in the file (default: the quantity with its unit, such as `displacement_um`)",
