@@ -194,7 +194,7 @@ def sweep(
     if keep:
         coords["phase"] = np.arange(samples) / samples
     result = xr.Dataset(data, coords=coords, attrs={"output": actuator.output, "drive": actuator.coil.drive})
-    unit = {"displacement": "m", "flux_density": "T", "magnetization": "A/m"}[actuator.output]
+    unit = UNITS[actuator.output]
     for name in ("peak_to_peak", "mean", "fundamental"):
         result[name].attrs["units"] = unit
     result["lag"].attrs["units"] = "rad"
@@ -235,16 +235,18 @@ def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, corne
 
 
 UNITS = {
-    "command": "A", "current": "A", "field": "A/m", "magnetization": "A/m", "flux_density": "T",
-    "free_displacement": "m", "displacement": "m", "relay_field": "A/m",
+    "current": "A", "field": "A/m", "magnetization": "A/m", "flux_density": "T", "free_displacement": "m", "displacement": "m",
+    "relay_field": "A/m",
 }  # fmt: skip
 
 
-def signals_dataset(signals: Signals, bench: str = ""):
-    """Every signal as a labelled xarray Dataset with units."""
+def signals_dataset(signals: Signals, actuator, bench: str = ""):
+    """Every signal as a labelled xarray Dataset with units; `actuator`: the one simulated, which knows what drives it and what is read."""
     import xarray as xr
 
     time = np.asarray(signals.time)
-    values = {n: np.asarray(getattr(signals, n)) for n in UNITS if getattr(signals, n) is not None}
-    data = {n: ("time", v, {"units": UNITS[n]}) for n, v in values.items()}
-    return xr.Dataset(data, coords={"time": ("time", time, {"units": "s"})}, attrs={"bench": bench})
+    drive = UNITS[actuator.coil.drive]
+    units = {"command": drive, **UNITS, "current": drive, "reading": UNITS[actuator.output]}
+    values = {n: np.asarray(getattr(signals, n)) for n in units if getattr(signals, n) is not None}
+    data = {n: ("time", v, {"units": units[n]}) for n, v in values.items()}
+    return xr.Dataset(data, coords={"time": ("time", time, {"units": "s"})}, attrs={"bench": bench, "output": actuator.output})

@@ -1,4 +1,4 @@
-"""Recordings out: CSV, NetCDF, MATLAB, Parquet, each whole or not at all."""
+"""Recordings out: CSV, NetCDF, MATLAB, Parquet, and datasets as NetCDF, each whole or not at all."""
 
 from pathlib import Path
 
@@ -19,16 +19,27 @@ UNITS = {
 def write_recording(path, recording) -> None:
     """Write a recording; the ending says how: .csv, .nc, .mat or .parquet (needs pyarrow)."""
     path = Path(path)
-    partial = path.with_name(path.name + ".part")
     writer = {".csv": _csv, ".nc": _netcdf, ".mat": _mat, ".parquet": _parquet}.get(path.suffix.lower())
     if writer is None:
         raise ConfigurationError(f"{path}: ending {path.suffix or '(none)'} is unknown; write .csv, .nc, .mat or .parquet")
+    _whole(path, lambda partial: writer(partial, recording))
+
+
+def write_dataset(path, data) -> None:
+    """Write an xarray Dataset as NetCDF, whole or not at all; raises `ConfigurationError` where it cannot be."""
+    _whole(Path(path), lambda partial: data.to_netcdf(partial, engine="h5netcdf"))
+
+
+def _whole(path, write):
+    """`write` a file beside `path`, then put it in its place."""
+    partial = path.with_name(path.name + ".part")
     try:
-        writer(partial, recording)
+        write(partial)
         partial.replace(path)
     except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None
+    finally:
         partial.unlink(missing_ok=True)
-        raise ConfigurationError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def _columns(recording):

@@ -56,6 +56,8 @@ def check_intervals(options) -> None:
 
 def intervals(result, options, folder, progress):
     """Bootstrap and profile of a fit as asked: (entries for fit.json, text)."""
+    from magjax.writers import write_dataset
+
     content, texts = {}, []
     executor = executor_of(options)
     if options.bootstrap is not None:
@@ -73,7 +75,7 @@ def intervals(result, options, folder, progress):
         content["bootstrap"] = found.as_dict()
         texts += [str(found), f"  {found.outcome}"]
         if folder:
-            found.dataset().to_netcdf(folder / "bootstrap.nc", engine="h5netcdf")
+            write_dataset(folder / "bootstrap.nc", found.dataset())
     if options.profile:
         from fitting.scale import profile_intervals
 
@@ -88,6 +90,7 @@ def run_fleet(options, choices, folder, progress) -> int:
     """magjax fit --fleet: fleet.csv and fleet.nc in the folder, a result folder for each actuator in it."""
     from fitting.result import write_atomically
     from fitting.scale import fit_fleet
+    from magjax.writers import write_dataset
 
     with progress:
         fleet = fit_fleet(
@@ -96,7 +99,7 @@ def run_fleet(options, choices, folder, progress) -> int:
         )  # fmt: skip
     if folder:
         write_atomically(folder / "fleet.csv", fleet.csv())
-        fleet.dataset().to_netcdf(folder / "fleet.nc", engine="h5netcdf")
+        write_dataset(folder / "fleet.nc", fleet.dataset())
         for row in fleet.rows:
             if row["status"] != "failed":
                 own = folder / row["name"]

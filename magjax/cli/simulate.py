@@ -1,5 +1,6 @@
 """Commands simulate and sweep."""
 
+import dataclasses
 import json
 
 from magjax.errors import ConfigurationError
@@ -28,8 +29,26 @@ def _target(path):
     from pathlib import Path
 
     path = Path(path)
+    if path.is_dir():
+        raise ConfigurationError(f"{path}: is a folder; give a file in it, as in --out {path / 'simulation.nc'}")
     output_folder(path.parent)
     return path
+
+
+def _drive_of(file, bench):
+    """(drive, dt, periodic) of a file that holds time and the drive at least; what else it holds is left aside.
+
+    Whole periods are led to their steady state; anything else runs once from the start state.
+    """
+    from magjax.recording import load_recordings
+
+    # what is read does not matter here: the drive stands for it, so that no reading need be there
+    found = load_recordings([file], dataclasses.replace(bench, output=bench.drive))
+    if len(found) > 1:
+        raise ConfigurationError(f"--drive {file}: holds {len(found)} recordings ({found[0].name}, ...); give a file with one")
+    recording, per = found[0], found[0].period_samples()
+    whole = per is not None and abs(recording.n_samples - per * round(recording.n_samples / per)) < 0.5
+    return recording.channels[bench.drive], recording.dt, whole
 
 
 def _options(command, text, example):
@@ -43,7 +62,10 @@ def run_simulate(arguments) -> int:
     """magjax simulate."""
     p = _options("simulate", "Simulate the chain for a biased sine or for the drive of a file; every signal goes to NetCDF.",
                  "magjax simulate --model result --frequency 50 --amplitude 0.8 --offset 0.1 --out run.nc")  # fmt: skip
-    p.add_argument("--drive", help="a recording whose drive is applied")
+    p.add_argument(
+        "--drive",
+        help="a file whose drive is applied: time and current (or field) suffice; whole periods are led to their steady state",
+    )
     p.add_argument("--frequency", type=float, default=50.0, help="Hz")
     p.add_argument("--amplitude", type=float, default=0.5, help="A")
     p.add_argument("--offset", type=float, default=0.0, help="A")
@@ -56,12 +78,10 @@ def run_simulate(arguments) -> int:
     actuator, bench = _actuator(options)
     path = _target(options.out)
     from magjax.simulate import signals_dataset, simulate
+    from magjax.writers import write_dataset
 
     if options.drive:
-        from magjax.recording import load_recordings
-
-        recording = load_recordings([options.drive], bench)[0]
-        drive, dt, periodic = recording.channels[bench.drive], recording.dt, recording.frequency() is not None
+        drive, dt, periodic = _drive_of(options.drive, bench)
     else:
         if options.samples < 20 or not options.frequency > 0:
             raise ConfigurationError("give --frequency above zero and --samples of 20 or more")
@@ -70,8 +90,8 @@ def run_simulate(arguments) -> int:
         dt, periodic = 1 / (options.frequency * options.samples), True
     with Progress(options.quiet):
         signals = simulate(actuator, drive, dt, periodic=periodic)
-        data = signals_dataset(signals, bench.name)
-    data.to_netcdf(path, engine="h5netcdf")
+        data = signals_dataset(signals, actuator, bench.name)
+        write_dataset(path, data)
     stroke = float(np.ptp(np.asarray(signals.reading)))
     print(json.dumps({"file": str(path), "peak_to_peak": stroke}) if options.json else f"peak to peak {stroke:.4g}; wrote {path}")
     return 0
@@ -106,11 +126,12 @@ def run_sweep(arguments) -> int:
     actuator, _ = _actuator(options)
     path = _target(options.out)
     from magjax.simulate import sweep
+    from magjax.writers import write_dataset
 
     grid = [_values(text) for text in (options.frequencies, options.amplitudes, options.offsets)]
     with Progress(options.quiet) as progress:
         data = sweep(actuator, *grid, executor=executor, checkpoint=options.checkpoint, progress=progress)
-    data.to_netcdf(path, engine="h5netcdf")
+        write_dataset(path, data)
     count = int(np.prod(list(data.sizes.values())))
     print(json.dumps({"file": str(path), "points": count}) if options.json else f"{count} steady states; wrote {path}")
     return 0
