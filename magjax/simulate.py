@@ -1,6 +1,7 @@
 """simulate(actuator, current, dt): the whole chain for one drive; sweep: a grid of frequencies, amplitudes and offsets.
 
-Current (A) or applied field (A/m) in, every signal of the chain out, SI. Periodic drives end in their steady state.
+Current (A) or applied field (A/m) in, every signal of the chain out, SI. Periodic drives end in their steady state, which is
+judged: a small loop, or one at a high frequency, settles over tens of periods where a large slow one takes two.
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .chain import Timeline
-from .chain.coupled import magnetize
+from .chain.coupled import magnetize, march_of, period_change, run_until_steady
 from .constants import MU0
 from .errors import ConfigurationError
 from .extrema import nesting
@@ -21,7 +22,10 @@ from .scale.devices import over_devices
 
 
 class Signals(eqx.Module):
-    """Every signal of the chain over time, SI; `residual` is that of the implicit step, A/m."""
+    """Every signal of the chain over time, SI; `residual` is that of the implicit step, A/m.
+
+    `unsettled`: of a steady state, how much the last two periods differ, relative to the peak to peak of H + M; else 0.
+    """
 
     time: Float[Array, " time"]
     command: Float[Array, " time"]
@@ -35,6 +39,11 @@ class Signals(eqx.Module):
     relay_field: Float[Array, " time"]
     residual: Float[Array, " time"]
     overflow: Array
+    unsettled: Array
+
+
+MOST_PERIODS = 250  # a drive that has not settled by then is told as it is
+TOLERANCE = 1e-8  # of a single steady state; a sweep asks for less
 
 
 def require_x64():
@@ -43,12 +52,13 @@ def require_x64():
         raise ConfigurationError('double precision is off; run jax.config.update("jax_enable_x64", True) before anything else')
 
 
-def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str | None = None) -> Signals:
+def run_chain(actuator, command, dt, periods: int, corners: int, scheme: str | None = None, until=None) -> Signals:
     """The chain as a pure function for `jit`, `vmap` and derivatives. `periods` = 0: not periodic; else run so many
-    and return the last. `scheme`: of the coupled step, the coil's own if None."""
-    line = Timeline(jnp.asarray(dt, dtype=float), command.shape[0], periods > 0)
+    and return the last. `scheme`: of the coupled step, the coil's own if None. `until` (tolerance, most): instead of
+    `periods`, as many as it takes until two differ by less than `tolerance`, see `run_until_steady`."""
+    line = Timeline(jnp.asarray(dt, dtype=float), command.shape[0], periods > 0 or until is not None)
     current = driven_current(actuator, command, line)
-    return finish_chain(actuator, line, command, current, *march_chain(actuator, line, current, periods, corners, scheme))
+    return finish_chain(actuator, line, command, current, *march_chain(actuator, line, current, periods, corners, scheme, until))
 
 
 def driven_current(actuator, command, line):
@@ -59,26 +69,34 @@ def driven_current(actuator, command, line):
     return current
 
 
-def march_chain(actuator, line, current, periods: int, corners: int, scheme: str | None = None):
-    """Coil and hysteresis: field H, magnetization M, relay field, residual (all (time,), A/m) and overflow; see `run_chain`."""
+def march_chain(actuator, line, current, periods: int, corners: int, scheme: str | None = None, until=None):
+    """Coil and hysteresis: field H, magnetization M, relay field, residual (all (time,), A/m), overflow, and how much the last
+    two periods differ; see `run_chain`."""
     scheme = scheme or actuator.coil.scheme
     count = current.shape[0]
     applied = actuator.coil.applied_field(current)
     table = actuator.hysteresis.table()
     memory = actuator.hysteresis.memory(table, corners)
-    if periods > 0:
-        whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (applied, current)]
-        parts = magnetize(actuator, *whole, line.dt, memory, scheme, period=count)
-        M_unreached = actuator.hysteresis.unreached(jnp.max(parts[2][-count:]), jnp.min(parts[2][-count:]))
-        H, M, v, residual = (x[-count - 1 : -1] for x in parts[:4])
-        M = M + M_unreached
+    if until is None and periods <= 0:
+        H, M, v, residual, overflow = magnetize(actuator, applied, current, line.dt, memory, scheme)
+        return H, M, v, residual, overflow, jnp.zeros(())
+    if until is not None:
+        whole = [jnp.append(x, x[:1]) for x in (applied, current)]
+        march = march_of(actuator, applied[0], current[0], line.dt, memory, scheme, count)
+        *rows, overflow, change = run_until_steady(march, *whole, *until)
+        M_unreached = actuator.hysteresis.unreached(jnp.max(rows[2]), jnp.min(rows[2]))
+        H, M, v, residual = (jnp.roll(x, 1) for x in rows)  # a period's end is its first sample
     else:
-        parts = magnetize(actuator, applied, current, line.dt, memory, scheme)
-        H, M, v, residual = parts[:4]
-    return H, M, v, residual, parts[4]
+        whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (applied, current)]
+        *rows, overflow = magnetize(actuator, *whole, line.dt, memory, scheme, period=count)
+        M_unreached = actuator.hysteresis.unreached(jnp.max(rows[2][-count:]), jnp.min(rows[2][-count:]))
+        H, M, v, residual = (x[-count - 1 : -1] for x in rows)
+        X = (rows[0] + rows[1])[:-1].reshape(periods, count)
+        change = period_change(X[-1], X[-2]) if periods > 1 else jnp.asarray(jnp.inf)
+    return H, M + M_unreached, v, residual, overflow, change
 
 
-def finish_chain(actuator, line, command, current, H, M, v, residual, overflow) -> Signals:
+def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, unsettled=0.0) -> Signals:
     """The blocks after the hysteresis: magnetostriction, mechanics, sensor, with their effects."""
     B = MU0 * (H + M)
     signals = {"command": command, "current": current, "field": H, "magnetization": M, "flux_density": B}
@@ -100,18 +118,29 @@ def finish_chain(actuator, line, command, current, H, M, v, residual, overflow) 
     reading = actuator.sensor(quantity)
     for effect in actuator.effects:
         reading = effect.reading(reading, {**signals, "displacement": displacement}, line, actuator)
-    return Signals(line.time, command, current, H, M, B, free, displacement, reading, v, residual, overflow)
+    return Signals(line.time, command, current, H, M, B, free, displacement, reading, v, residual, overflow, unsettled)
 
 
 _run = eqx.filter_jit(run_chain)
 
 
-def simulate(actuator, current, dt: float, *, periodic: bool = False, settle: int = 3, corners=None, scheme=None) -> Signals:
+def simulate(
+    actuator,
+    current,
+    dt: float,
+    *,
+    periodic: bool = False,
+    settle: int | None = None,
+    tolerance: float = TOLERANCE,
+    corners=None,
+    scheme=None,
+) -> Signals:
     """Simulate the actuator.
 
     `current`: (time,), A (applied field, A/m, on a field-driven bench). `dt`: s. `periodic`: the samples are one period
-    (or several whole ones) of a steady drive; `settle` further repetitions run first. `corners`: room for the memory,
-    found from the drive if None. Raises `ConfigurationError` for NaN, a drive outside the plane, or a lost corner.
+    (or several whole ones) of a steady drive, repeated until two repetitions differ by less than `tolerance` of the peak to
+    peak of H + M (`MOST_PERIODS` at most: `unsettled` of the result tells what is left), or exactly `settle` times before
+    the one that is returned. `corners`: room for the memory, found from the drive if None. Raises `ConfigurationError` for NaN, a drive outside the plane, or a lost corner.
 
     >>> import jax, numpy as np; jax.config.update("jax_enable_x64", True)
     >>> from magjax.bench import load_bench
@@ -132,10 +161,15 @@ def simulate(actuator, current, dt: float, *, periodic: bool = False, settle: in
         actuator = dataclasses.replace(actuator, hysteresis=actuator.hysteresis.rested())
     needed = _corners(actuator, drive, periodic) if corners is None else corners
     # dt as an array: a Python number would be part of the program, compiled anew for every frequency
-    signals = _run(actuator, jnp.asarray(drive), jnp.asarray(dt, float), (settle + 1) if periodic else 0, needed, scheme)
+    steps = (jnp.asarray(drive), jnp.asarray(dt, float))
+    if periodic and settle is None:
+        signals = _run(actuator, *steps, 0, needed, scheme, (jnp.asarray(tolerance, float), MOST_PERIODS))
+    else:
+        signals = _run(actuator, *steps, (settle + 1) if periodic else 0, needed, scheme)
     if bool(signals.overflow):
         raise ConfigurationError(f"the drive leaves more than {needed} nested corners in the memory; raise corners")
-    _refuse_outside(actuator, signals)
+    reached = np.asarray(signals.relay_field)
+    _refuse_outside(actuator, reached.min(), reached.max())
     return signals
 
 
@@ -146,32 +180,42 @@ def _corners(actuator, drive, periodic: bool) -> int:
     return int(4 * np.ceil((nesting(drive) + start) / 4))
 
 
-def _refuse_outside(actuator, signals):
+def _refuse_outside(actuator, lowest, highest, where=""):
+    """Refuse a drive that leads the relays' field beyond the plane, where every relay is saturated and nothing is known."""
     low, high = float(actuator.hysteresis.low), float(actuator.hysteresis.high)
     width = high - low
-    reached = np.asarray(signals.relay_field)
-    if reached.min() < low - 0.02 * width or reached.max() > high + 0.02 * width:
+    if lowest < low - 0.02 * width or highest > high + 0.02 * width:
         raise ConfigurationError(
-            f"the drive leads the field to {reached.min():.5g}..{reached.max():.5g} A/m, outside the Preisach plane "
+            f"the drive{where} leads the field to {lowest:.5g}..{highest:.5g} A/m, outside the Preisach plane "
             f"{low:.5g}..{high:.5g} A/m; lower the drive or widen the plane (limits in the bench file)"
         )
 
 
 def sweep(
-    actuator, frequencies, amplitudes, offsets=(0.0,), *, samples: int = 250, settle: int = 2, chunk: int = 512, keep=False,
-    executor=None, checkpoint=None, progress=None,
+    actuator, frequencies, amplitudes, offsets=(0.0,), *, samples: int = 250, settle: int | None = None, tolerance: float = 3e-4,
+    chunk: int = 512, keep=False, executor=None, checkpoint=None, progress=None,
 ):  # fmt: skip
     """Steady states for a grid of biased sines, as a labelled xarray Dataset.
 
-    `frequencies` Hz, `amplitudes` and `offsets` in the unit of the drive. Returns peak-to-peak and mean reading,
-    amplitude and phase of its fundamental, and loss per cycle; `keep=True` adds the waveforms. The grid is run in
-    chunks of `chunk` trajectories, so memory does not grow with it, each over the devices that JAX sees; `executor`,
-    `checkpoint` and `progress` as in `magjax.scale.run_job`: the numbers are the same to the last bit for any of them.
+    `frequencies` Hz, `amplitudes` and `offsets` in the unit of the drive; `settle` and `tolerance` as in `simulate`
+    (where a small loop creeps, three to four times the tolerance may be left). Returns
+    peak-to-peak and mean reading, amplitude and phase of its fundamental, loss per cycle, and `unsettled`, how much the last
+    two periods differ; `keep=True` adds the waveforms. The grid is run in chunks of `chunk` trajectories, so memory does not
+    grow with it, each over the devices that JAX sees; `executor`, `checkpoint` and `progress` as in `magjax.scale.run_job`:
+    the numbers are the same to the last bit for any of them. Raises `ConfigurationError` for a frequency that is not above
+    zero, a drive outside the plane, or a lost corner.
     """
     import xarray as xr
 
     require_x64()
     axes = [np.atleast_1d(np.asarray(x, float)) for x in (frequencies, amplitudes, offsets)]
+    for name, values in zip(("frequencies", "amplitudes", "offsets"), axes, strict=True):
+        wrong = values[~np.isfinite(values) | ((values <= 0) & (name == "frequencies"))]
+        if wrong.size or not values.size:
+            found = f"{wrong[0]:g} among them" if wrong.size else "none given"
+            raise ConfigurationError(
+                f"{name}: {found}; give {'numbers above zero, Hz' if name == 'frequencies' else 'finite numbers'}"
+            )
     grid = [x.ravel() for x in np.meshgrid(*axes, indexing="ij")]
     shape = tuple(len(x) for x in axes)
     start = actuator.hysteresis.history.shape[0] // 2
@@ -182,7 +226,15 @@ def sweep(
     for begin in range(0, total, chunk):
         index = np.arange(begin, min(begin + chunk, total))
         chunks.append(Chunk(f"{begin}-{begin + len(index) - 1}", [x[index] for x in grid]))
-    inputs = {"actuator": actuator, "chunk": chunk, "samples": samples, "periods": settle + 1, "corners": corners, "keep": keep}
+    inputs = {
+        "actuator": actuator,
+        "chunk": chunk,
+        "samples": samples,
+        "settle": settle,
+        "tolerance": tolerance,
+        "corners": corners,
+        "keep": keep,
+    }
     parts = run_job(Job("sweep", _sweep_part, inputs, tuple(chunks)), executor, checkpoint=checkpoint, progress=progress).results
     columns = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
     dims = ("frequency", "amplitude", "offset")
@@ -193,31 +245,48 @@ def sweep(
     coords = dict(zip(dims, axes, strict=True))
     if keep:
         coords["phase"] = np.arange(samples) / samples
-    result = xr.Dataset(data, coords=coords, attrs={"output": actuator.output, "drive": actuator.coil.drive})
+    result = xr.Dataset(
+        data, coords=coords, attrs={"output": actuator.output, "drive": actuator.coil.drive, "tolerance": tolerance}
+    )
     unit = UNITS[actuator.output]
     for name in ("peak_to_peak", "mean", "fundamental"):
         result[name].attrs["units"] = unit
     result["lag"].attrs["units"] = "rad"
     result["loss"].attrs["units"] = "J/m^3"
     result["frequency"].attrs["units"] = "Hz"
+    result["unsettled"].attrs["units"] = "1"
     return result
 
 
 def _sweep_part(inputs, points, rng):
     """One chunk of a sweep, filled up by its last point to the common size so that all run the same program."""
-    count = len(points[0])
-    full = [np.append(x, np.full(inputs["chunk"] - count, x[-1])) for x in points]
-    options = {k: inputs[k] for k in ("samples", "periods", "corners", "keep")}
-    found = over_devices(_sweep_chunk, inputs["actuator"], full, **options)
-    return {k: np.asarray(v)[:count] for k, v in found.items()}
+    actuator, count = inputs["actuator"], len(points[0])
+    # slow ones beside slow ones: a batch goes on until its last one has settled
+    order = np.argsort(points[0] / np.maximum(np.abs(points[1]), 1e-12), kind="stable")
+    full = [np.append(x[order], np.full(inputs["chunk"] - count, x[order[-1]])) for x in points]
+    until = None if inputs["settle"] is not None else (inputs["tolerance"], MOST_PERIODS)
+    options = {k: inputs[k] for k in ("samples", "corners", "keep")}
+    found = over_devices(_sweep_chunk, actuator, full, periods=(inputs["settle"] or 0) + 1, until=until, **options)
+    back = np.argsort(order, kind="stable")
+    found = {k: np.asarray(v)[:count][back] for k, v in found.items()}
+    for k, (low, high, overflow) in enumerate(zip(*(found.pop(n) for n in ("lowest", "highest", "overflow")), strict=True)):
+        where = f" at {points[0][k]:g} Hz, amplitude {points[1][k]:g}, offset {points[2][k]:g}"
+        _refuse_outside(actuator, low, high, where)
+        if overflow:
+            raise ConfigurationError(f"the drive{where} leaves more than {inputs['corners']} nested corners in the memory")
+    return found
+
+
+BATCH = 32  # trajectories side by side on a CPU: more are no faster, and wait for each other to settle
 
 
 @eqx.filter_jit
-def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, corners, keep):
+def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, until, corners, keep):
     phase = 2 * jnp.pi * jnp.arange(samples) / samples
 
-    def one(f, A, b):
-        signals = run_chain(actuator, b + A * jnp.sin(phase), 1 / (f * samples), periods, corners)
+    def one(point):
+        f, A, b = point
+        signals = run_chain(actuator, b + A * jnp.sin(phase), 1 / (f * samples), periods, corners, until=until)
         y = signals.reading
         tone = 2 * jnp.mean(y * jnp.exp(-1j * phase)) * 1j
         applied = actuator.coil.applied_field(signals.current)
@@ -228,10 +297,18 @@ def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, corne
             "fundamental": jnp.abs(tone),
             "lag": -jnp.angle(tone),
             "loss": 0.5 * jnp.sum((applied + jnp.roll(applied, -1)) * (jnp.roll(B, -1) - B)),
+            "unsettled": signals.unsettled,
+            "lowest": jnp.min(signals.relay_field),
+            "highest": jnp.max(signals.relay_field),
+            "overflow": signals.overflow,
         }
         return {**results, "reading": y, "field": signals.field} if keep else results
 
-    return jax.vmap(one)(frequency, amplitude, offset)
+    count = len(frequency)
+    width = min(count, BATCH) if jax.default_backend() == "cpu" else count
+    rows = jnp.minimum(jnp.arange(-(-count // width) * width), count - 1).reshape(-1, width)
+    found = jax.lax.map(jax.vmap(one), [x[rows] for x in (frequency, amplitude, offset)])
+    return {k: v.reshape(-1, *v.shape[2:])[:count] for k, v in found.items()}
 
 
 UNITS = {

@@ -140,9 +140,63 @@ def test_sweep_equals_single_runs_and_does_not_depend_on_chunks():
     parts = sweep(act, **grid, chunk=3)
     assert np.allclose(one.peak_to_peak, parts.peak_to_peak, rtol=1e-12)
     n = 250
-    alone = simulate(act, 0.8 * np.sin(2 * np.pi * np.arange(n) / n), 1 / (120 * n), periodic=True, settle=2)
+    alone = simulate(act, 0.8 * np.sin(2 * np.pi * np.arange(n) / n), 1 / (120 * n), periodic=True, tolerance=one.tolerance)
     assert float(one.peak_to_peak.sel(frequency=120, amplitude=0.8).item()) == pytest.approx(
         float(np.ptp(np.asarray(alone.reading))), rel=1e-10
     )
     assert float(one.loss.min()) > 0
     assert one.peak_to_peak.attrs["units"] == "m"
+
+
+def test_small_loops_and_high_frequencies_are_led_until_they_settle():
+    """Two repetitions leave up to 0.4 of the peak to peak there; a large slow loop needs no more than two."""
+    act = load_bench("aa-050h").actuator()
+    n = 250
+    for f, amplitude in ((5, 0.8), (100, 0.05), (400, 0.05), (1000, 0.6)):
+        drive, dt = 0.1 + amplitude * np.sin(2 * np.pi * np.arange(n) / n), 1 / (f * n)
+        best = simulate(act, drive, dt, periodic=True, settle=120)
+        got = simulate(act, drive, dt, periodic=True)
+        stroke = float(np.ptp(np.asarray(best.reading)))
+        assert np.asarray(got.reading) == pytest.approx(np.asarray(best.reading), abs=3e-7 * stroke)
+        assert float(got.unsettled) < 1e-8
+        swept = sweep(act, f, amplitude, 0.1, keep=True)
+        assert swept.reading.values.ravel() == pytest.approx(np.asarray(best.reading), abs=2e-3 * stroke)
+        assert swept.unsettled.item() < swept.tolerance
+
+
+def test_what_has_not_settled_says_so(monkeypatch):
+    monkeypatch.setattr("magjax.simulate.MOST_PERIODS", 3)
+    act = load_bench("aa-050h").actuator()
+    drive, dt = 0.1 + 0.05 * np.sin(2 * np.pi * np.arange(250) / 250), 1 / (300 * 250)
+    assert float(simulate(act, drive, dt, periodic=True).unsettled) == pytest.approx(
+        float(simulate(act, drive, dt, periodic=True, settle=2).unsettled), rel=0.2
+    )
+    swept = sweep(act, [10.0, 300.0], [0.05, 0.8], 0.1)
+    assert (swept.unsettled.values > swept.tolerance).ravel().tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("grid", "words"),
+    [
+        (([10.0], [0.5, 5.0]), "at 10 Hz, amplitude 5, offset 0 leads the field to .* outside the Preisach plane"),
+        (([10.0], [0.5], [0.0, 2.0]), "offset 2 leads the field"),
+        (([10.0, -100.0, 0.0], [0.5]), "frequencies: -100 among them; give numbers above zero"),
+        (([np.nan], [0.5]), "frequencies: nan"),
+        (([10.0], [np.inf]), "amplitudes: inf"),
+        (([], [0.5]), "frequencies: none given"),
+    ],
+)
+def test_a_sweep_refuses_what_a_simulation_refuses(grid, words):
+    with pytest.raises(ConfigurationError, match=words):
+        sweep(load_bench("aa-050h").actuator(), *grid, samples=60)
+
+
+def test_a_sweep_tells_a_lost_corner(monkeypatch):
+    from magjax import simulate as module
+
+    lost = {"lowest": 1e4, "highest": 1e4, "overflow": True, "peak_to_peak": 1.0}
+    monkeypatch.setattr(
+        module, "over_devices", lambda run, actuator, rows, **_: {k: np.full(len(rows[0]), v) for k, v in lost.items()}
+    )
+    with pytest.raises(ConfigurationError, match="amplitude 0.5, offset 0 leaves more than 4 nested corners"):
+        sweep(load_bench("aa-050h").actuator(), [10.0], [0.5])

@@ -94,3 +94,18 @@ def test_a_file_with_several_drives_is_not_cut_to_its_first(tmp_path, capsys):
         == 2
     )
     assert "holds 2 recordings" in one_line(capsys)
+
+
+@pytest.mark.parametrize("command", ["simulate", "sweep"])
+def test_what_has_not_settled_is_not_to_be_trusted(tmp_path, capsys, monkeypatch, command):
+    monkeypatch.setattr("magjax.simulate.MOST_PERIODS", 3)
+    grid = ["--frequency", "300", "--amplitude"] if command == "simulate" else ["--frequencies", "300", "--amplitudes"]
+    assert main([command, *grid, "0.05", "--out", str(tmp_path / "a.nc"), "--quiet"]) == 4
+    assert "not settled" in capsys.readouterr().out and (tmp_path / "a.nc").is_file()
+    assert main([command, *grid, "0.8", "--out", str(tmp_path / "a.nc"), "--quiet"]) == (4 if command == "simulate" else 0)
+    assert "not settled" in capsys.readouterr().out or command == "sweep"
+
+
+def test_a_sweep_outside_the_plane_writes_nothing(tmp_path, capsys):
+    assert main(["sweep", "--frequencies", "10", "--amplitudes", "5,9", "--out", str(tmp_path / "a.nc"), "--quiet"]) == 2
+    assert "outside the Preisach plane" in one_line(capsys) and not list(tmp_path.iterdir())

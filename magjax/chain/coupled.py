@@ -11,6 +11,8 @@ The backward formula does not ring where the time constant mu0 k (1 + dM/dH) is 
 and turns into M(applied field) for k = 0; the trapezoid has the smaller error constant where the loop is resolved.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -182,28 +184,41 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
     `disturbance`: what is added at every step as an effect would, (field shift, magnetization, loss), A/m, (time,) each.
     `period`: steps of a period where the drive repeats, else 0: at its ends slow states are led to where they repeat.
     """
+    march = march_of(actuator, applied[0], current[0], h, memory, scheme, period)
+    return run_march(march, applied, current, disturbance, period)
+
+
+class March(NamedTuple):
+    """A march ready to go: the state at the first sample, the row (H, M, relay field, residual) there, and one step."""
+
+    carry: object
+    first: tuple
+    advance: object
+
+
+def march_of(actuator, applied, current, h, memory: Memory, scheme: str, period: int = 0) -> March:
+    """The march of (4) from equilibrium at `applied`, A/m, and `current`, both scalars; the rest as in `magnetize`."""
     if scheme not in SCHEMES:
         raise ConfigurationError(f'scheme = "{scheme}" is unknown; write one of {", ".join(SCHEMES)}')
     for effect in actuator.effects:
         if effect.shells:
-            from .shells import march_shells  # which is built on this module
+            from .shells import march_of_shells  # which is built on this module
 
-            return march_shells(actuator, effect.share(), effect.shells, applied, current, h, memory, scheme, disturbance, period)
+            return march_of_shells(actuator, effect.share(), effect.shells, applied, current, h, memory, scheme, period)
     table = actuator.hysteresis.table()
     effects = tuple(e for e in actuator.effects if e.in_step)
     a = MU0 * actuator.coil.loss / h
     bdf = scheme == "bdf2"
     p, q = (1 + 1.5 * a, 1.5 * a) if bdf else (0.5 + a, a)
 
-    memory = apply_field(table, memory, applied[0])
+    memory = apply_field(table, memory, applied)
     zero = jnp.zeros_like(memory.field)
-    rest = Trial(memory.field, memory.magnetization, zero, zero, current[0], h)
+    rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
     states = tuple(e.start(rest, actuator) for e in effects)
     _, shift, added = _extra_terms(effects, states, actuator, rest, p, q)
     first = memory.field + shift
     X = first + memory.magnetization + added
-    carry = _Carry(memory, X, X, first, applied[0], states, zero, states)
-    ends = _ends_of_periods(len(applied), period)
+    carry = _Carry(memory, X, X, first, applied, states, zero, states)
 
     def advance(c: _Carry, drive):
         applied1, current1, end, *given = drive
@@ -235,14 +250,50 @@ def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trap
         states, marks = _settle(effects, states, c.marks, end, period * h)
         return _Carry(memory, H + M, c.X0, H, applied1, states, residual, marks), (H, M, v, residual)
 
-    carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:], ends, *(d[1:] for d in disturbance or ())))
+    return March(carry, (first, rest.magnetization + added, rest.field, zero), advance)
 
-    def with_first(value, rest):
-        return jnp.concatenate([jnp.reshape(value, (1,)), rest])
 
-    H = with_first(first, H)
-    M = with_first(rest.magnetization + added, M)
-    return H, M, with_first(rest.field, v), with_first(zero, residual), carry.memory.overflow
+def run_march(march: March, applied, current, disturbance=None, period: int = 0):
+    """All samples of a march: field H, magnetization M, relay field, residual, (time,) each, and overflow."""
+    ends = _ends_of_periods(len(applied), period)
+    drive = (applied[1:], current[1:], ends, *(d[1:] for d in disturbance or ()))
+    carry, rows = jax.lax.scan(march.advance, march.carry, drive)
+    # the first sample of a rod in shells is their mean
+    whole = (jnp.concatenate([jnp.reshape(x.mean(), (1,)), y]) for x, y in zip(march.first, rows, strict=True))
+    return *whole, carry.memory.overflow.any()
+
+
+def run_until_steady(march: March, applied, current, tolerance, most):
+    """The last of so many repetitions of a period that the next would be the same, from its second sample to its first.
+
+    `applied`, `current`: one period and its first sample again, (period + 1,); `march`: of that `period`. It goes on until
+    H + M in the second half of a period, behind its extrema, differs from the period before by less than `tolerance` of its
+    peak to peak, or `most` periods are through. Returns field H, magnetization M, relay field, residual, (period,) each,
+    overflow, and the last such difference. Not for reverse-mode derivatives.
+    """
+    count = len(applied) - 1
+    drive = (applied[1:], current[1:], _ends_of_periods(count + 1, count))
+
+    def going(state):
+        _, _, change, number = state
+        return (change > tolerance) & (number < most)
+
+    def again(state):
+        carry, (H0, M0, *_), _, number = state
+        carry, rows = jax.lax.scan(march.advance, carry, drive)
+        X, X0 = rows[0] + rows[1], H0 + M0
+        change = period_change(X, X0)
+        return carry, rows, jnp.where(number > 0, change, jnp.inf), number + 1
+
+    rows = (jnp.zeros(count),) * 4
+    carry, rows, change, _ = jax.lax.while_loop(going, again, (march.carry, rows, jnp.asarray(jnp.inf), 0))
+    return *rows, carry.memory.overflow.any(), change
+
+
+def period_change(X, before):
+    """How much the second half of a period differs from that of the one before, relative to the period's peak to peak."""
+    half = len(X) // 2
+    return jnp.max(jnp.abs(X[half:] - before[half:])) / jnp.maximum(jnp.max(X) - jnp.min(X), 1e-300)
 
 
 def _ends_of_periods(count, period):

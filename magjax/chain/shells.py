@@ -19,7 +19,7 @@ from jax.lax import stop_gradient
 from ..constants import MU0
 from ..effects.base import Trial
 from ..preisach.memory import apply_field, branch_magnetization
-from .coupled import _ends_of_periods, _extra_terms, _settle, _slope
+from .coupled import March, _extra_terms, _settle, _slope, run_march
 
 CLOSE_ENOUGH = 1e-10  # A/m relative to half the plane
 MOST_STEPS = 60
@@ -56,6 +56,12 @@ class _Carry(eqx.Module):
 
 def march_shells(actuator, share, count: int, applied, current, h, memory, scheme: str, disturbance=None, period: int = 0):
     """`coupled.magnetize` for a rod of `count` shells, of whose loss a `share` is distributed as in a solid cylinder."""
+    march = march_of_shells(actuator, share, count, applied[0], current[0], h, memory, scheme, period)
+    return run_march(march, applied, current, disturbance, period)
+
+
+def march_of_shells(actuator, share, count: int, applied, current, h, memory, scheme: str, period: int = 0) -> March:
+    """`coupled.march_of` for such a rod."""
     table = actuator.hysteresis.table()
     effects = tuple(e for e in actuator.effects if e.in_step and not e.shells)
     bdf = scheme == "bdf2"
@@ -63,14 +69,14 @@ def march_shells(actuator, share, count: int, applied, current, h, memory, schem
     D = (1 + share * (distribution(count) - 1)) / count
     p0, Q = (1.0, 1.5 * a * D) if bdf else (0.5, a * D)
 
-    memory = jax.vmap(lambda _: apply_field(table, memory, applied[0]))(jnp.arange(count))
+    memory = jax.vmap(lambda _: apply_field(table, memory, applied))(jnp.arange(count))
     zero = jnp.zeros_like(memory.field)
-    rest = Trial(memory.field, memory.magnetization, zero, zero, current[0], h)
+    rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
     states = _of_every_shell(tuple(e.start(rest, actuator) for e in effects), count)
     _, shift, added = _extra_terms(effects, states, actuator, rest, 0.0, 0.0)
     first = memory.field + shift
     X = first + memory.magnetization + added
-    carry = _Carry(memory, X, X, first, applied[0], states, states)
+    carry = _Carry(memory, X, X, first, applied, states, states)
 
     def advance(c: _Carry, drive):
         applied1, current1, end, *given = drive
@@ -100,11 +106,7 @@ def march_shells(actuator, share, count: int, applied, current, h, memory, schem
         row = (H.mean(), M.mean(), v.mean(), residual[jnp.argmax(jnp.abs(residual))])
         return _Carry(moved, H + M, c.X0, H, applied1, states, marks), row
 
-    ends = _ends_of_periods(len(applied), period)
-    carry, (H, M, v, residual) = jax.lax.scan(advance, carry, (applied[1:], current[1:], ends, *(d[1:] for d in disturbance or ())))
-    rows = ((first, H), (rest.magnetization + added, M), (rest.field, v), (zero, residual))
-    H, M, v, residual = (jnp.concatenate([jnp.reshape(x.mean(), (1,)), y]) for x, y in rows)
-    return H, M, v, residual, carry.memory.overflow.any()
+    return March(carry, (first, rest.magnetization + added, rest.field, zero), advance)
 
 
 def _of_every_shell(states, count):

@@ -77,7 +77,7 @@ def run_simulate(arguments) -> int:
     prepare_jax()
     actuator, bench = _actuator(options)
     path = _target(options.out)
-    from magjax.simulate import signals_dataset, simulate
+    from magjax.simulate import MOST_PERIODS, TOLERANCE, signals_dataset, simulate
     from magjax.writers import write_dataset
 
     if options.drive:
@@ -92,9 +92,12 @@ def run_simulate(arguments) -> int:
         signals = simulate(actuator, drive, dt, periodic=periodic)
         data = signals_dataset(signals, actuator, bench.name)
         write_dataset(path, data)
-    stroke = float(np.ptp(np.asarray(signals.reading)))
-    print(json.dumps({"file": str(path), "peak_to_peak": stroke}) if options.json else f"peak to peak {stroke:.4g}; wrote {path}")
-    return 0
+    stroke, settled = float(np.ptp(np.asarray(signals.reading))), not float(signals.unsettled) > TOLERANCE
+    text = f"peak to peak {stroke:.4g}; wrote {path}"
+    if not settled:
+        text += f"; not settled: the last two of {MOST_PERIODS} periods still differ by {float(signals.unsettled):.1e} of the peak to peak"
+    print(json.dumps({"file": str(path), "peak_to_peak": stroke, "settled": settled}) if options.json else text)
+    return 0 if settled else 4
 
 
 def _values(text):
@@ -125,7 +128,7 @@ def run_sweep(arguments) -> int:
     prepare_jax()
     actuator, _ = _actuator(options)
     path = _target(options.out)
-    from magjax.simulate import sweep
+    from magjax.simulate import MOST_PERIODS, sweep
     from magjax.writers import write_dataset
 
     grid = [_values(text) for text in (options.frequencies, options.amplitudes, options.offsets)]
@@ -133,5 +136,9 @@ def run_sweep(arguments) -> int:
         data = sweep(actuator, *grid, executor=executor, checkpoint=options.checkpoint, progress=progress)
         write_dataset(path, data)
     count = int(np.prod(list(data.sizes.values())))
-    print(json.dumps({"file": str(path), "points": count}) if options.json else f"{count} steady states; wrote {path}")
-    return 0
+    left = int((data.unsettled > data.tolerance).sum())
+    text = f"{count} steady states; wrote {path}"
+    if left:
+        text += f"; {left} not settled after {MOST_PERIODS} periods: see the variable unsettled"
+    print(json.dumps({"file": str(path), "points": count, "unsettled": left}) if options.json else text)
+    return 4 if left else 0

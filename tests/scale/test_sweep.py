@@ -13,6 +13,7 @@ import xarray as xr
 
 from magjax.bench import load_bench
 from magjax.cli import main
+from magjax.errors import ConfigurationError
 from magjax.simulate import sweep
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,6 +36,8 @@ def test_processes_and_a_resumed_sweep(plain, tmp_path):
     seen.clear()
     again = sweep(actuator, **GRID, checkpoint=path, progress=lambda *a: seen.append(a))
     assert again.identical(plain) and [a[1] for a in seen] == [2, 3]
+    with pytest.raises(ConfigurationError, match="amplitude 5, offset 0 leads the field"):
+        sweep(actuator, [60.0], [0.5, 5.0], samples=60, executor="processes:1")
     # waveforms travel too
     kept = sweep(actuator, [60.0], [0.5], samples=60, keep=True, checkpoint=tmp_path / "kept")
     assert kept.reading.shape == (1, 1, 1, 60)
