@@ -119,7 +119,12 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
             same = start is not None and start.problem.layout.density_unknowns == known.layout.density_unknowns
             weights = start.solution.weights if same else START_WEIGHTS[: len(known.layout.penalties)]
             found = solve(
-                known, z, weights, max_jacobians=choices.max_jacobians, target=target, progress=lambda k, c: say("fit", k, c)
+                known,
+                z,
+                weights,
+                max_jacobians=choices.max_jacobians,
+                target=target,
+                progress=lambda k, c: say(f"fit from {rest}", k, c),
             )
             return known, found, tried
 

@@ -22,25 +22,26 @@ class Ended(Exception):
 def together(calls, progress=None, needless=None) -> list:
     """Results of `calls`, each a function of one progress function, in their order, two at a time.
 
-    `progress`: called as progress(text, step, chi2 per datum) by one of them at a time. `needless(k, results)`: whether the
-    results so far, {number: result}, make call k of no use; it is ended at its next word and gives None, ended or not.
+    `progress`: called as progress(text, step, chi2 per datum), with all words of one call before those of the next: these
+    are kept until it is their turn. `needless(k, results)`: whether the results so far, {number: result}, make call k of no
+    use; it is ended at its next word and gives None, ended or not.
     The first error, or Ctrl-C, ends the others and is raised.
     """
     calls = list(calls)
     if len(calls) < 2:
         return [call(progress or (lambda *words: None)) for call in calls]
-    ended, speaking, results = [threading.Event() for _ in calls], threading.Lock(), {}
+    ended, results = [threading.Event() for _ in calls], {}
+    turns = _Turns(len(calls), progress or (lambda *words: None))
 
     def run(k):
         def say(*words):
             if ended[k].is_set():
                 raise Ended
-            if progress is not None:
-                with speaking:
-                    progress(*words)
+            turns.say(k, words)
 
         with contextlib.suppress(Ended):
             results[k] = calls[k](say)
+        turns.over(k)
 
     with concurrent.futures.ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
         waited = [pool.submit(run, k) for k in range(len(calls))]
@@ -56,6 +57,33 @@ def together(calls, progress=None, needless=None) -> list:
                 future.cancel()
             raise
     return [None if ended[k].is_set() else results[k] for k in range(len(calls))]
+
+
+class _Turns:
+    """Words of calls that run side by side, passed on call by call: whose turn it is speaks at once, others wait."""
+
+    def __init__(self, count, progress):
+        self.progress, self.lock = progress, threading.Lock()
+        self.waiting, self.done, self.turn = [[] for _ in range(count)], set(), 0
+
+    def say(self, k, words):
+        with self.lock:
+            self.waiting[k].append(words)
+            self._pass_on()
+
+    def over(self, k):
+        with self.lock:
+            self.done.add(k)
+            self._pass_on()
+
+    def _pass_on(self):
+        while self.turn < len(self.waiting):
+            words, self.waiting[self.turn] = self.waiting[self.turn], []
+            for word in words:
+                self.progress(*word)
+            if self.turn not in self.done:
+                return
+            self.turn += 1
 
 
 def let_go() -> None:

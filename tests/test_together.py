@@ -38,8 +38,39 @@ def test_an_error_ends_the_others(error):
             time.sleep(0.01)
 
     with pytest.raises(type(error)):
-        together([first, endless], lambda *w: words.append(w))
+        together([endless, first], lambda *w: words.append(w))
     assert words
+
+
+def test_words_come_call_by_call_whatever_the_clock():
+    met = threading.Barrier(2, timeout=20)
+
+    def call(name):
+        def run(say):
+            for k in range(3):
+                met.wait()  # word by word side by side
+                say(name, k, None)
+
+        return run
+
+    words = []
+    together([call("a"), call("b")], lambda *w: words.append(w))
+    assert words == [(name, k, None) for name in "ab" for k in range(3)]
+
+
+def test_whose_turn_it_is_speaks_at_once():
+    words, heard = [], threading.Event()
+
+    def first(say):
+        say("now", 1, None)
+        assert heard.wait(20)
+
+    def tell(*word):
+        words.append(word)
+        heard.set()
+
+    together([first, lambda say: say("later", 1, None)], tell)
+    assert [w[0] for w in words] == ["now", "later"]
 
 
 def test_what_another_makes_needless_is_ended_and_given_up():

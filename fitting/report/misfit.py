@@ -89,7 +89,7 @@ def against(evidence, stem: str = "against"):
         axes[0].legend(loc="best", handlelength=1.6)
         axes[0].set_ylabel("residual / noise of a sample")
         frequency, chi2 = evidence["frequency"], evidence["chi2"]
-        # a recording has about 81 numbers: five standard deviations of chi2/N
+        # a recording has about 81 numbers: three standard deviations of chi2/N
         axes[2].axhspan(max(1 - 3 * np.sqrt(2 / 81), 0.3), 1 + 3 * np.sqrt(2 / 81), color=PALE, lw=0)
         axes[2].plot(frequency, np.maximum(chi2, 1e-3), ls="", marker="o", ms=5, mfc="none", mec=VERMILION, mew=1.4)
         axes[2].set(
@@ -203,38 +203,43 @@ def spectrum(evidence, output: str, stem: str = "spectrum"):
         return picture(figure, stem, "Spectrum: harmonics against the noise floor", caption)
 
 
+STAGES = {
+    "fit from negative": "from negative saturation",
+    "fit from demagnetized": "from the demagnetized state",
+    "fit from positive": "from positive saturation",
+}  # start memories, in words
+
+
 def convergence(history, stem: str = "convergence"):
     """chi2/N after each Jacobian, one line a stage."""
     stages = stages_of(history)
     colours = [BLUE, VERMILION, GREEN, ORANGE, SKY, INK]
     with styled():
         figure = canvas(WIDTH, 2.5)
-        axes = figure.add_axes([0.08, 0.2, 0.88, 0.77])
-        begin = 0
+        axes = figure.add_axes([0.08, 0.2, 0.64, 0.77])
         for k, (name, values) in enumerate(stages):
-            at = begin + np.arange(1, len(values) + 1)
+            at = np.arange(1, len(values) + 1)
             axes.plot(at, values, color=colours[k % 6], marker=MARKERS[k % 8], ms=3.5, mfc="white", lw=1.1, label=name)
-            begin = at[-1]
         axes.axhline(1, color=MUTED, lw=0.6, ls=":")
-        axes.set(yscale="log", xlabel="Jacobians", ylabel="χ²/N")
+        axes.set(yscale="log", xlabel="Jacobians of the stage", ylabel="χ²/N")
         low, high = min(min(v) for _, v in stages), max(max(v) for _, v in stages)
         axes.set_ylim(min(0.7, low / 1.3), max(3.0, high * 1.4))
         plain_ticks(axes, "y")
         axes.xaxis.get_major_locator().set_params(integer=True)
-        axes.legend(loc="upper right")
+        axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1), borderaxespad=0)
         ends = "; ".join(f"{name}: {plain(v[0])} to {plain(v[-1])} in {len(v)}" for name, v in stages)
         return picture(figure, stem, "Convergence", f"Misfit after each Jacobian; the dotted line is the noise. {ends}.")
 
 
 def stages_of(history) -> list[tuple[str, list[float]]]:
-    """The history cut where a stage begins anew: (name, chi2/N of its steps)."""
+    """The history cut where a stage begins anew, each in words: (name, chi2/N of its steps)."""
     stages: list[tuple[str, list[float]]] = []
     last = (None, 0)
     for text, step, chi2 in history:
         if chi2 is None or not chi2 > 0:
             continue
         if text != last[0] or step <= last[1]:
-            stages.append((text, []))
+            stages.append((STAGES.get(text, text), []))
         stages[-1][1].append(chi2)
         last = (text, step)
     numbered, seen = [], {}

@@ -1,11 +1,13 @@
 """The summaries of a residual on signals whose answer is known."""
 
+import re
 import types
 
 import numpy as np
 import pytest
 
-from fitting.report.misfit import stages_of
+from fitting.fit import RESTS_IN_ORDER
+from fitting.report.misfit import STAGES, convergence, stages_of
 from fitting.report.residuals import autocorrelation, by_field_and_rate, by_phase, traces
 
 
@@ -68,11 +70,31 @@ def test_folding_keeps_the_phase():
 
 def test_the_history_is_cut_into_stages():
     steps = [
-        ("fit", 1, 9.0),
-        ("fit", 2, 3.0),
-        ("fit", 1, 8.0),
+        ("fit from negative", 1, 9.0),
+        ("fit from negative", 2, 3.0),
+        ("fit from positive", 1, 8.0),
+        ("finer density", 1, 4.0),
         ("finer density", 1, 2.0),
         ("trying creep", 0, None),
         ("finer density", 2, 1.0),
     ]
-    assert stages_of(steps) == [("fit", [9.0, 3.0]), ("fit (2)", [8.0]), ("finer density", [2.0, 1.0])]
+    assert stages_of(steps) == [
+        ("from negative saturation", [9.0, 3.0]),
+        ("from positive saturation", [8.0]),
+        ("finer density", [4.0]),
+        ("finer density (2)", [2.0, 1.0]),
+    ]
+    assert "from positive saturation" in convergence(steps).svg
+
+
+def test_every_start_memory_has_a_name():
+    assert {f"fit from {rest}" for rest in RESTS_IN_ORDER} == set(STAGES)
+
+
+def test_a_convergence_panel_counts_each_stage_by_itself_and_keeps_its_legend_off_the_data():
+    steps = [(f"fit from {rest}", k, 9.0 / k) for rest in RESTS_IN_ORDER for k in range(1, 8)]
+    svg = convergence(steps).svg
+    ticks = [int(x) for x in re.findall(r"anchor: middle[^>]*>(\d+)<", svg)]
+    assert ticks == list(range(1, 8))
+    (legend,) = re.findall(r'x="([\d.]+)"[^>]*>from negative saturation<', svg)
+    assert float(legend) > 0.72 * 720  # where the axes end, points
