@@ -9,6 +9,8 @@ from .style import plain
 NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
 BELOW_NOISE, AT_NOISE, FAR = 0.5, 1.1, 2.0  # chi2/N: noise overstated; the error bars hold; they mean nothing
 WORST_AT_NOISE = 1.6
+WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|[^\s'"])+""")  # of a command line
+FIT_ALONE = ("--cells", "--bootstrap", "--bootstrap-kind", "--profile", "--workers", "--scheduler", "--checkpoint")
 
 
 def validity(fit) -> tuple[str, str, str, str]:
@@ -17,9 +19,9 @@ def validity(fit) -> tuple[str, str, str, str]:
     bound = [n for n, p in fit["parameters"].items() if p["at_bound"]]
     loose = [n for n, p in fit["parameters"].items() if p["free"] and not p["identified"]]
     worst = max((r["chi2_per_sample"] for r in fit["recordings"]), default=chi2)
-    ask = "Run the diagnosis on the same files; it says what physics is missing, and where:"
+    ask = "Run the diagnosis on the same files; it says what physics is missing, and where."
     if not fit["converged"]:
-        mend = "Raise --max-jacobians, or start nearer with --model."
+        mend = "The options for it: --max-jacobians and --model."
         return "bad", "Not converged: these numbers are not a result", mend, "not valid"
     if chi2 is None or chi2 != chi2:
         mend = "Check the signs and units of the channels in the bench file."
@@ -66,12 +68,41 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
         section("Inside the model", sketch(evidence.get("inside"), loops.inside, evidence, drive)),
         section("How the fit went", convergence_part(sketch, fit), part(table=tables.numbers(fit))),
     ]
-    command = fit.get("reproduce", "").replace("magjax fit", "magjax diagnose", 1) if "diagnosis" in advice else ""
+    command = diagnose_command(fit.get("reproduce", "")) if "diagnosis" in advice else ""
+    if "magjax diagnose" in fit["message"]:  # it is said
+        advice = ""
     facts = f"Bench {fit['bench']}; {number} recording{'s' if number != 1 else ''}, {plain(span[0], 4)} to {plain(span[-1], 4)} Hz."
     return {
         "title": f"Joint fit of {fit['bench']}", "facts": facts, "tone": tone, "headline": headline, "message": [sentence(fit["message"])],
         "advice": advice, "command": command, "sections": [s for s in sections if s],
     }  # fmt: skip
+
+
+def diagnose_command(reproduce: str) -> str:
+    """The diagnosis of the same files into a folder of its own, from the command of a fit; "" where there is none.
+
+    What only a fit can be asked for is left out.
+    """
+    words = WORD.findall(reproduce)
+    if words[:2] != ["magjax", "fit"] or "--fleet" in words:
+        return ""
+    said, before = ["magjax", "diagnose"], ""
+    for word in words[2:]:
+        option, _, value = word.partition("=")
+        if before == "--out":
+            word = _beside(word)
+        elif option == "--out" and value:
+            word = f"--out={_beside(value)}"
+        if before not in FIT_ALONE and option not in FIT_ALONE:
+            said.append(word)
+        before = word
+    return " ".join(said)
+
+
+def _beside(folder: str) -> str:
+    """A folder beside that of the fit, quoted as it was."""
+    quote = folder[-1] if folder[-1] in "'\"" else ""
+    return f"{folder.removesuffix(quote).rstrip('/')}-diagnosis{quote}"
 
 
 def residual_section(sketch, evidence, output, title: str = "What the fit leaves", with_map: bool = True):

@@ -12,7 +12,7 @@ import pytest
 
 from fitting.report import rebuild
 from fitting.report.diagnosis_page import _size, headline, interval, placebo_section
-from fitting.report.fit_page import sentence, validity
+from fitting.report.fit_page import diagnose_command, sentence, validity
 from magjax.errors import ConfigurationError
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
@@ -153,6 +153,8 @@ def test_the_banner_of_a_fit(folders):
     good, bad = ((folders[k] / "report.html").read_text(encoding="utf-8") for k in ("fit", "poor"))
     assert "the error bars hold" in good and 'class="banner good"' in good and "not valid" not in good
     assert 'class="banner bad"' in bad and "std. error (not valid)" in bad
+    said = Outline(bad).all("section")[0][2].lower()
+    assert said.count("raise") == said.count("start nearer") == 1 and "--max-jacobians" in said
     fit = json.loads((folders["fit"] / "fit.json").read_text())
     assert validity(fit)[3] == ""
     tone, said, advice, doubt = validity({**fit, "chi2_per_sample": 9.0})
@@ -171,7 +173,28 @@ def test_a_bad_fit_says_the_command_that_follows(folders, tmp_path):
     fit = json.loads((folders["fit"] / "fit.json").read_text()) | {"chi2_per_sample": 9.0}
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     page = rebuild(tmp_path).read_text(encoding="utf-8")
-    assert "<code>magjax diagnose rec_*.csv --bench aa-050h --out result</code>" in page
+    assert "<code>magjax diagnose rec_*.csv --bench aa-050h --out result-diagnosis</code>" in page  # not over the fit
+    fit["message"] = "the residual is 3 times the noise; run magjax diagnose on the same files"
+    for reproduce, command in ((fit["reproduce"], True), ("magjax demo --seed 0", False)):
+        (tmp_path / "fit.json").write_text(json.dumps({**fit, "reproduce": reproduce}))
+        banner = Outline(rebuild(tmp_path).read_text(encoding="utf-8")).all("section")[0][2]
+        assert banner.count("on the same files") == 1 and ("--bench" in banner) == command
+
+
+@pytest.mark.parametrize(
+    ("fit", "diagnosis"),
+    [
+        ("magjax fit a.csv b.csv --bench x", "magjax diagnose a.csv b.csv --bench x"),
+        ("magjax fit a.csv --out=made/ --model old", "magjax diagnose a.csv --out=made-diagnosis --model old"),
+        ("magjax fit 'my a.csv' --out 'my fit/' --quiet", "magjax diagnose 'my a.csv' --out 'my fit-diagnosis' --quiet"),
+        ("magjax fit --cells 25 a.csv --bootstrap=9 --check c.csv", "magjax diagnose a.csv --check c.csv"),
+        ("magjax fit --fleet one two --out all", ""),
+        ("magjax demo --seed 0", ""),
+        ("", ""),
+    ],
+)
+def test_the_command_of_the_diagnosis_is_one_that_can_be_given(fit, diagnosis):
+    assert diagnose_command(fit) == diagnosis
 
 
 def test_the_verdict_comes_first_and_in_plain_words(folders, diagnoses):
