@@ -81,10 +81,12 @@ def next_experiment(trials, spectra, bench, also=()) -> dict | None:
                 "offset": float(offset),
                 "periods": PERIODS,
             }
-            found["separates"] = [[a, b, float(p)] for (a, b), p in zip(_pairs(names), odds, strict=True) if a == names[0]]
-            parts.append(f"{sine}: separates {names[0]} from {names[1]} with probability {odds.min():.2f}")
+            found["separates"] = [[a, b, float(p)] for (a, b), p in zip(_pairs(names), odds, strict=True)]
+            pairs = [f"{a} from {b} with probability {p:.2f}" for a, b, p in found["separates"]]
+            parts.append(f"{sine}: separates {', '.join(pairs)}")
         else:
-            parts.append(f"no sine within the limits does as well (the best, {sine}, with probability {odds.min():.2f})")
+            worst = "" if len(odds) == 1 else " of the nearest two"
+            parts.append(f"no sine within the limits does as well (the best, {sine}, with probability {odds.min():.2f}{worst})")
     found["text"] = "; ".join(parts) if len(parts) < 2 or found["drive"] is None else f"{parts[0]}; or {parts[1]}"
     return found
 

@@ -74,3 +74,16 @@ def test_a_sine_is_proposed_only_where_it_decides(monkeypatch, gap, sine):
         ]
     else:
         assert "no sine within the limits" in found["text"]
+
+
+def test_text_and_table_give_the_same_probabilities(monkeypatch):
+    """Of three rivals the nearest two need not be the first two."""
+    apart = np.full((10, 3), 8.0)
+    apart[:, 2] = 3.2  # of the second from the third
+    monkeypatch.setattr(experiments, "separations", lambda *a: apart)
+    rivals = [rival("duffing_stiffness", "mechanics"), rival("delta_e", "mechanics"), rival("creep", "mechanics")]
+    found = next_experiment(rivals, SPECTRA, load_bench("aa-050h"))
+    assert [row[:2] for row in found["separates"]][2] == ["delta_e", "creep"] and len(found["separates"]) == 3
+    assert found["separates"][0][2] == 0.99 and found["separates"][2][2] == pytest.approx(0.945, abs=1e-3)
+    for a, b, p in found["separates"]:
+        assert f"{a} from {b} with probability {p:.2f}" in found["text"]
