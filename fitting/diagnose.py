@@ -47,7 +47,7 @@ def diagnose(
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
     reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
-    `placebo_runs`: fits of recordings that lack nothing, to see how often the search would cry wolf. Returns a `Diagnosis`;
+    `placebo_runs`: fits of recordings that lack nothing, to see how often the screening would alarm. Returns a `Diagnosis`;
     raises `RecordingError` where a recording cannot be used at all.
     """
     bench = load_bench(bench)
@@ -87,9 +87,6 @@ def diagnose(
     cleaned_check = remove_from_checks(check, [e for e, _ in adopted], bench)
     base_now, candidates = _screened_finer(recordings, bench, base_now, candidates, choices, held, progress)
     place = where(base_now, candidates, recordings, bench.output)
-    absorbed = tuple(
-        c.name for c in candidates if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY and abs(c.z) < Z_THRESHOLD
-    )
     reached = search(recordings, bench, base_now, candidates, choices, progress, cleaned_check)
     evidence = Evidence(
         reached,
@@ -102,7 +99,7 @@ def diagnose(
         (check, cleaned_check),
         _floors(base_now),
         place,
-        absorbed,
+        _absorbed(candidates, reached.tried),
     )
     found = verdict(evidence)
     if found.verdict == "unknown_at":
@@ -121,6 +118,12 @@ def diagnose(
     else:
         return found
     return dataclasses.replace(found, message=found.message + note)
+
+
+def _absorbed(candidates, tried) -> tuple[str, ...]:
+    """What these recordings could not show: the density makes nearly all of it. What scores or was fitted did show."""
+    silent = [c for c in candidates if abs(c.z) < Z_THRESHOLD and c.name not in tried]
+    return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY)
 
 
 def _sensor_zero(recordings, bench, base, candidates, actuator, held, choices, progress):

@@ -309,7 +309,7 @@ def _joined(known, found, plain, final, check_plain, check, bench, texts):
         found,
         verdict=verdict,
         message=f"{text} {rest}",
-        effects=(*rows, *found.effects),
+        effects=(*rows, *({**e, "shifts": shifts} for e in found.effects)),
         base=plain,
         repaired=final,
         check=tuple(checks),

@@ -72,7 +72,7 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
             break
         excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
         trials = _trials((recordings, bench, state.current), top, candidates, chosen, excess, progress)
-        state.tried.update({t.name: t.candidate for t in trials})
+        state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
         if not good:
             break

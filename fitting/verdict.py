@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.effects import CATALOGUE
 
-from .attribute import MISFIT, confidence
+from .attribute import MISFIT, chi2_of, confidence
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .instruments import exchange
@@ -142,7 +142,6 @@ def too_little(reached, plain) -> str | None:
 
 def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     """The `Diagnosis`. `rough`: what is left has been looked for and is put down to the density."""
-    tried = evidence.reached.tried
     dropped = too_little(evidence.reached, evidence.plain)
     if dropped:
         evidence = dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, current=evidence.plain, steps=[]))
@@ -151,7 +150,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     rows = tuple(check_errors(evidence.raw.actuator, current.actuator, raw, evidence.bench, clean)) if raw else ()
     common = {
         "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
-        "candidates": tuple(tried.get(c.name, c) for c in evidence.candidates), "repaired": current if steps or evidence.adopted else None,
+        "candidates": _achieved(evidence), "repaired": current if steps or evidence.adopted else None,
     }  # fmt: skip
     full = FULL_SHARE if evidence.excess < CLEAN_CHI2 else FULLER_SHARE
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
@@ -174,6 +173,24 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     return dataclasses.replace(found, message=found.message + ROUGH_TEXT) if rough else found
 
 
+def _achieved(evidence) -> tuple:
+    """The candidates as the screening of the plain fit scored them, with what real fits achieved.
+
+    A trial counts beside the fit that it was tried beside. The one effect that a repair adds counts as it ended.
+    """
+    steps, current, plain = evidence.reached.steps, evidence.reached.current, evidence.plain
+    fitted = evidence.reached.tried | {best.name: best.candidate for best, *_ in steps}
+    if len(steps) == 1:
+        best, drop = steps[0][0], float(chi2_of(plain) - chi2_of(current))
+        bic = float(best.parameters * np.log(plain.data_count) - drop)
+        fitted[best.name] = dataclasses.replace(best.candidate, achieved_chi2_drop=drop, bic_change=bic)
+    keys = ("achieved_chi2_drop", "bic_change")
+    return tuple(
+        dataclasses.replace(c, **{k: getattr(fitted[c.name], k) for k in keys}) if c.name in fitted else c
+        for c in evidence.candidates
+    )
+
+
 def _found(evidence):
     """Effects that stand alone (rows), groups (names), the size that each of their members would have, and the trials of the
     last group."""
@@ -184,18 +201,19 @@ def _found(evidence):
             sizes |= {r.name: _record_row(r)["parameters"] for r in (effect, *rivals)}
         else:
             effects.append(_record_row(effect))
-    for best, rivals, good, previous in evidence.reached.steps:
+    for best, rivals, good, _ in evidence.reached.steps:
         if len(rivals) > 1:
             groups.append([t.name for t in rivals])
             sizes |= {t.name: _sizes(t.name, evidence.reached.current if t is best else t.result) for t in rivals}
             last = rivals
         else:
-            effects.append(_effect_row(best, good, previous, evidence.reached.current))
+            effects.append(_effect_row(best, good, evidence.raw, evidence.reached.current))
     return effects, groups, sizes, last
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
-    text = f"nothing is missing: chi2/N = {evidence.excess:.2f} and "
+    what = "nothing of the catalogue" if rough or evidence.missing else "nothing"
+    text = f"{what} is missing: chi2/N = {evidence.excess:.2f} and "
     if dropped:
         text += f"{dropped}, which serves best, takes less than half of what is above the noise."
     else:
@@ -266,10 +284,11 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
     return Diagnosis("unknown_at", text + note, unknown=unknown, **common)
 
 
-def _effect_row(trial, tried, previous, final) -> dict:
+def _effect_row(trial, tried, base, final) -> dict:
+    """An effect found: its size, and from what to what the constants of the base moved."""
     result = final if any(e.name == trial.name for e in final.actuator.effects) else trial.result
     shifts = {
-        e.name: [e.value, result.estimate(e.name).value] for e in previous.estimates if e.free and not e.name.startswith("effects.")
+        e.name: [e.value, result.estimate(e.name).value] for e in base.estimates if e.free and not e.name.startswith("effects.")
     }
     return {
         "name": trial.name, "block": trial.candidate.block, "parameters": _sizes(trial.name, result),

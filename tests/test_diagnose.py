@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 
 import fitting.diagnose as module
+import fitting.search as search_module
+from fitting.attribute import Trial, chi2_of
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
 from fitting.placebo import placebo
+from fitting.screen import Candidate
+from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
+from fitting.verdict import Evidence, _achieved, _found
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording
@@ -58,6 +63,70 @@ def test_names_a_concealed_sensor_filter(bench):
     assert row["rms_before"] > 3 * row["noise_rms"] and row["rms_after"] < 1.4 * row["noise_rms"]
     before, after = effect["shifts"]["mechanics.f0"]
     assert abs(after - 405) < 0.2 * abs(before - 405)
+    assert (before, after) == tuple(r.estimate("mechanics.f0").value for r in (found.base, found.repaired))
+    named = next(c for c in found.candidates if c.name == "sensor_lag")  # the fall is that of its last fit
+    assert named.achieved_chi2_drop == pytest.approx(chi2_of(found.base) - chi2_of(found.repaired))
+    assert named.bic_change == pytest.approx(2 * np.log(found.base.data_count) - named.achieved_chi2_drop)
+    assert not set(found.absorbed) & {c.name for c in found.candidates if c.achieved_chi2_drop is not None}
+
+
+def scored(name, z, visibility=0.1, **achieved):
+    return Candidate(name, "coil", z, visibility, 1.0, {}, z * z, 1.0, True, **achieved)
+
+
+def a_fit(chi2, R_eddy, *effects):
+    estimates = (SimpleNamespace(name="coil.R_eddy", value=R_eddy, free=True),)
+    effects = tuple(SimpleNamespace(name=n) for n in effects)
+    return SimpleNamespace(
+        converged=True, choices=None, chi2_per_sample=chi2, data_count=100, estimates=estimates, actuator=SimpleNamespace(effects=effects), estimate=lambda name: estimates[0]
+    )  # fmt: skip
+
+
+def trial(name, result, drop):
+    return Trial(scored(name, 20.0, achieved_chi2_drop=drop, bic_change=9 - drop), result, drop, 9 - drop, True, 1.0, 2)
+
+
+def evidence_of(steps, plain, current, candidates, tried):
+    reached = Reached(current, steps, tried)
+    return Evidence(reached, (), plain, plain, candidates, (), None, ((), ()), {}, {}, ())
+
+
+def test_shifts_are_those_of_the_base_whatever_step_named_the_effect():
+    plain, half, whole = a_fit(15.0, 58.0), a_fit(4.0, 60.0, "creep"), a_fit(1.0, 62.0, "creep", "excess_loss")
+    first, second = trial("creep", half, 1100.0), trial("excess_loss", whole, 300.0)
+    effects, *_ = _found(evidence_of([(first, [first], [first], plain), (second, [second], [second], half)], plain, whole, (), {}))
+    assert [e["shifts"] for e in effects] == [{"coil.R_eddy": [58.0, 62.0]}] * 2
+
+
+def test_a_candidate_keeps_its_score_beside_the_plain_fit_and_shows_what_its_last_fit_achieved():
+    """An effect found second, beside one that was dropped again: what it took then is not what it takes."""
+    plain, whole = a_fit(15.0, 58.0), a_fit(1.0, 62.0, "excess_loss")
+    second = trial("excess_loss", whole, 300.0)
+    candidates = (scored("excess_loss", 80.0), scored("creep", 70.0), scored("backlash", 3.0))
+    tried = {"excess_loss": second.candidate, "creep": trial("creep", plain, 1100.0).candidate}
+    rows = _achieved(evidence_of([(second, [second], [second], plain)], plain, whole, candidates, tried))
+    assert [c.z for c in rows] == [80.0, 70.0, 3.0]
+    assert [c.achieved_chi2_drop for c in rows] == [1400.0, 1100.0, None]
+    assert rows[0].bic_change == pytest.approx(2 * np.log(100) - 1400)
+
+
+def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(monkeypatch):
+    fits = [a_fit(15.0, 58.0), a_fit(4.0, 60.0, "creep"), a_fit(3.0, 62.0, "creep", "backlash")]
+    rounds = iter([[trial("creep", fits[1], 1100.0), trial("backlash", fits[1], 900.0)], [trial("backlash", fits[2], 100.0)], []])
+    for name, made in {
+        "leaders": lambda candidates: candidates, "_trials": lambda *a: next(rounds), "screened": lambda *a: [scored("backlash", 20.0)],
+        "_finer": lambda r, b, now, best, good, *a: (best, good, None), "_backward": lambda *a: None, "_exchange": lambda *a: None,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(search_module, name, made)
+    reached = search_module.search([], None, fits[0], [scored("creep", 40.0)], Choices(), None)
+    assert [best.name for best, *_ in reached.steps] == ["creep", "backlash"]
+    assert reached.tried["backlash"].achieved_chi2_drop == 900.0
+
+
+def test_what_scores_or_was_fitted_is_not_absorbed():
+    candidates = [scored("quartic_magnetostriction", 22.8, 0.003), scored("linear_strain", 3.0, 0.003), scored("mean_field", 2.0)]
+    candidates += [scored("accommodation", 4.0, 0.003), scored("creep", 1.0)]
+    assert module._absorbed(candidates, {"accommodation": None}) == ("linear_strain", "mean_field")
 
 
 @pytest.mark.parametrize("inside", ["the first fit", "trials side by side"])
