@@ -1,7 +1,8 @@
-"""The placebo: does the search name something on recordings that lack nothing?
+"""The placebo: does the screening alarm on recordings that lack nothing?
 
 The final model stands in for the truth: its harmonics with fresh noise of the stated size are fitted and screened as the
-recordings were. What scores above the threshold there is a false alarm. A rough truth that the density cannot follow is not
+recordings were. What scores above the threshold there is a false alarm of the screening. It names nothing yet: the fits of
+the leaders with their gates, which a diagnosis goes on to, are not run here. A rough truth that the density cannot follow is not
 in it: that is what the check recordings and the blind suites are for.
 """
 

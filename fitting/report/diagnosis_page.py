@@ -5,7 +5,7 @@ import math
 
 from . import found as pictures
 from . import learned, loops, misfit, plane, tables
-from .fit_page import convergence_part, headed, residual_section, sentence, validity
+from .fit_page import AT_NOISE, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
 from .style import percent, plain, scale_of, unit_text
 
@@ -18,6 +18,7 @@ TONES = {
     "data_problem": "bad",
 }
 RUN_PLACEBO = "To run it: add --placebo 20 to the command that made this folder."
+FORETOLD = 1.4  # times its noise, up to which a check recording is foretold
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
 
@@ -40,7 +41,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         _checks(found, evidence, sketch, output, drive),
         _where(found, facts, base, sketch, output),
         _ranking(found, facts, sketch),
-        _loops(base, repaired, sketch, output, drive),
+        _loops(found, base, repaired, sketch, output, drive),
         _left(found, base, repaired, sketch, output),
         _shifts(found),
         placebo_section(found.get("placebo"), "data_problem" if broken else found["verdict"]),
@@ -60,7 +61,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         else ""
     )
     return {
-        "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else TONES.get(found["verdict"], "bad"),
+        "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else tone(found),
         "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
         "message": [said or sentence(spoken(found["message"], names))], "sections": [s for s in sections if s],
     }  # fmt: skip
@@ -78,6 +79,30 @@ def spoken(text: str, names) -> str:
     return text
 
 
+def tone(found) -> str:
+    """The colour of the banner: a silent verdict over a misfit is a warning."""
+    silent = found["verdict"] == "nothing_missing"
+    return "warn" if silent and still_left(found) else TONES.get(found["verdict"], "bad")
+
+
+def still_left(found) -> str:
+    """What the plain model leaves above the noise of fitted and of check recordings, in words; "" where it is nothing."""
+    said, base = [], found["base"] or {"chi2_per_sample": 0.0, "recordings": []}
+    chi2, worst = base["chi2_per_sample"], max(base["recordings"], key=lambda r: r["chi2_per_sample"], default=None)
+    if chi2 > AT_NOISE:
+        said.append(f"a misfit of χ²/N = {plain(chi2)} is left")
+    elif worst and worst["chi2_per_sample"] > WORST_AT_NOISE:
+        said.append(f"one recording is left with a misfit of χ²/N = {plain(worst['chi2_per_sample'])}")
+    missed = [r for r in found["check"] if r["noise_rms"] and r["rms_after"] > FORETOLD * r["noise_rms"]]
+    if missed:
+        r = max(missed, key=lambda r: r["rms_after"] / r["noise_rms"])
+        fine, unit = scale_of(tables.CHANNEL_OF.get(r["unit"], "displacement"))[2:]
+        said.append(
+            f"a check recording is missed by {plain(fine * r['rms_after'])} {unit} (noise {plain(fine * r['noise_rms'])} {unit})"
+        )
+    return " and ".join(said)
+
+
 def headline(found) -> str:
     """The verdict in plain words."""
     verdict = found["verdict"]
@@ -86,7 +111,11 @@ def headline(found) -> str:
         return f"Found what the model leaves out: {names}"
     if verdict == "group":
         names = "; ".join(" or ".join(words(n) for n in g) for g in found["groups"])
-        return f"Something is missing, and these recordings cannot say which: {names}"
+        beside = ", ".join(f"{words(e['name'])} ({e['block']})" for e in found["effects"])
+        found_beside = f"; found beside it: {beside}" if beside else ""
+        return f"Something is missing, and these recordings cannot say which: {names}{found_beside}"
+    if verdict == "nothing_missing" and (left := still_left(found)):
+        return f"Nothing of the catalogue is missing; {left}"
     if verdict == "unknown_at":
         where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
         return f"Something is missing that no effect of the catalogue explains; it acts most like the block {where}"
@@ -117,7 +146,7 @@ def _named(found, facts):
 def _size(parameters) -> str:
     """Parameters with their errors."""
     return "; ".join(
-        f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'] if p['unit'] != '1' else '')}".strip()
+        f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'])}".strip()
         for n, p in parameters.items()
     )
 
@@ -173,16 +202,26 @@ def _checks(found, evidence, sketch, output, drive):
     if not found["check"]:
         return None
     repaired = bool(found["repaired"])
-    drawn = sketch(evidence.get("checks"), loops.checks, evidence.get("checks"), output, drive, found["check"], repaired)
+    checks = evidence.get("checks")
+    drawn = sketch(checks, loops.checks, checks, output, drive, found["check"], repaired, added(found))
     title = "Check recordings, before and after" if repaired else "Check recordings"
     return section(title, part(table=tables.checks(found["check"], repaired)), drawn)
 
 
-def _loops(base, repaired, sketch, output, drive):
+def added(found) -> str:
+    """The effects that the repaired model holds beyond the plain one, in words."""
+    held = [
+        {n.split(".")[1]: 0 for n in (found[k] or {}).get("parameters", {}) if n.startswith("effects.")}
+        for k in ("base", "repaired")
+    ]
+    return " and ".join(words(n) for n in held[1] if n not in held[0])
+
+
+def _loops(found, base, repaired, sketch, output, drive):
     if not base or not base["chosen"].size:
         return None
     title = "Fitted recordings, before and after" if repaired else "Measured and fitted loops"
-    return section(title, sketch(base, loops.loops, base, output, drive, repaired or None))
+    return section(title, sketch(base, loops.loops, base, output, drive, repaired or None, added(found)))
 
 
 def _where(found, facts, base, sketch, output):
@@ -218,12 +257,13 @@ def _ranking(found, facts, sketch):
         return None
     rows = []
     for c in ranked:
-        unit = facts.get(c["name"], {}).get("unit", "")
-        unit = "" if unit == "1" else f" {unit_text(unit)}"
-        fell = plain(c["achieved_chi2_drop"]) if c["achieved_chi2_drop"] is not None else "not fitted"
+        unit = f" {unit_text(facts.get(c['name'], {}).get('unit', ''))}".rstrip()
+        drop = c["achieved_chi2_drop"]
+        fell = "not fitted" if drop is None else plain(drop) if drop >= 0 else f"rose by {plain(-drop)}"
+        strong = "–" if c["name"] in found["absorbed"] else power(c, facts)
         bic = plain(c["bic_change"]) if c["bic_change"] is not None else ""
         rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), f"{plain(c['amplitude'])}{unit}",
-                     f"{plain(c['smallest_visible'])}{unit}", power(c, facts), plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
+                     f"{plain(c['smallest_visible'])}{unit}", strong, plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
     head = [
         "effect",
         "block",
@@ -238,7 +278,8 @@ def _ranking(found, facts, sketch):
     ]
     note = (
         "z: score in standard deviations. Visibility: what share of its mark the base model cannot imitate. Visible from: amplitude seen at five "
-        "standard deviations. Power: probability that these recordings would show the effect at the top of its typical range."
+        "standard deviations. Power: probability that these recordings would show the effect at the top of its typical range. Achieved: what "
+        "a fit with the effect took, that of an adopted one as it ended; where χ² rose, the fit did not settle."
     )
     absorbed = ", ".join(words(n) for n in found["absorbed"])
     text = f"These recordings could not show {absorbed}: the density imitates them." if absorbed else ""
@@ -275,41 +316,38 @@ def _left(found, base, repaired, sketch, output):
 
 def _shifts(found):
     after = (found["repaired"] or {}).get("parameters", {})
+    shifts = {name: pair for e in found["effects"] for name, pair in e["shifts"].items()}
+    if not shifts and found["groups"] and found["base"]:  # those of the leading rival, which the repaired model holds
+        before = {n: p["value"] for n, p in found["base"]["parameters"].items() if p["free"] and not n.startswith("effects.")}
+        shifts = {n: [value, after[n]["value"]] for n, value in before.items() if n in after}
     rows = []
-    for e in found["effects"]:
-        for name, (before, now) in e["shifts"].items():
-            error = after.get(name, {}).get("stderr", 0.0)
-            apart = plain(abs(now - before) / error, 2) if error else "–"
-            share = f"{100 * (before - now) / abs(now):+.2g} %".replace("-", "−") if now else "–"
-            rows.append(
-                [
-                    name,
-                    words(e["name"]),
-                    tables.to_error(before, error),
-                    tables.to_error(now, error),
-                    unit_text(after.get(name, {}).get("unit", "")),
-                    share,
-                    apart,
-                ]
-            )
+    for name, (before, now) in shifts.items():
+        error = after.get(name, {}).get("stderr", 0.0)
+        apart = plain(abs(now - before) / error, 2) if error else "–"
+        share = f"{100 * (before - now) / abs(now):+.2g} %".replace("-", "−") if now else "–"
+        unit = unit_text(after.get(name, {}).get("unit", ""))
+        rows.append([name, tables.to_error(before, error), tables.to_error(now, error), unit, share, apart])
     if not rows:
         return None
     text = "To make up for what it lacked, the plain model had bent these constants; beside each, what it had got wrong."
-    head = ["parameter", "when adding", "before", "after", "unit", "was wrong by", "in standard errors"]
+    if found["groups"]:
+        leading = " and ".join(words(g[0]) for g in found["groups"])
+        text += f" So it is if the leading rival is right: {leading}."
+    head = ["parameter", "before", "after", "unit", "was wrong by", "in standard errors"]
     return section(
         "Parameter shifts", part(text=text, table=tables.table("Constants before and after the repair", head, rows, code=True))
     )
 
 
 def placebo_section(placebo, verdict):
-    """How often the same search names something on recordings that lack nothing; or that it was not run, and how to."""
-    title = "Placebo: would the search cry wolf?"
+    """How often the screening alarms on recordings that lack nothing; or that this was not tried, and how to."""
+    title = "False alarms of the screening"
     if not placebo:
         if verdict == "data_problem":
             return None
         text = (
-            "Not run. The placebo simulates the final model on the same drives with fresh noise, fits and screens those recordings, and "
-            "counts how often something scores above the threshold, though nothing more is there."
+            "Not tried. The final model is simulated on the same drives with fresh noise; those recordings are fitted and screened, and it is "
+            "counted how often something scores above the threshold, though nothing more is there."
         )
         return section(title, part(text=text), part(text=RUN_PLACEBO))
     number = next((int(placebo[k]) for k in ("runs", "searches", "count", "n", "trials") if k in placebo), 0)
@@ -319,12 +357,15 @@ def placebo_section(placebo, verdict):
         low, high = interval(false, number)
         parts.append(
             part(
-                text=f"In {number} searches on recordings simulated from the final model, {false} named something more, where nothing more was "
-                f"({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)})."
+                text=f"In {false} of {number} sets of recordings simulated from the final model something scored above the threshold, where "
+                f"nothing more was ({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)}). An alarm names nothing yet: a "
+                "diagnosis goes on to fit what alarms beside its rivals, and drops what does not earn its place; that was not done here."
             )  # fmt: skip
         )
     rows = [[words(str(k)), _shown(v)] for k, v in placebo.items()]
-    return section(title, *parts, part(table=tables.table("The placebo in numbers", ["quantity", "value"], rows)))
+    return section(
+        title, *parts, part(table=tables.table("The screening of recordings that lack nothing", ["quantity", "value"], rows))
+    )
 
 
 def _shown(value) -> str:
@@ -350,8 +391,12 @@ def _models(found, evidence, sketch, drive):
         yield section(
             sentence(repair_words(found)).rstrip("."),
             part(text=sentence(repaired["message"])),
-            *(part(table=t) for t in tables.parameters(repaired, validity(repaired)[3], f"Parameters of {repair_words(found)}")),
+            *(
+                part(table=t)
+                for t in tables.parameters(repaired, validity(repaired)[3], f"Parameters of {repair_words(found)}", bounds_of(best))
+            ),
             part(table=tables.correlations(repaired)),
+            part(text=plane.never_switched(best)),
             sketch(best, plane.mass_map, best),
             sketch(best.get("inside"), loops.inside, best, drive),
             convergence_part(sketch, repaired),
@@ -359,12 +404,21 @@ def _models(found, evidence, sketch, drive):
     if base:
         spoilt = found["verdict"] == "data_problem" or not math.isfinite(base["chi2_per_sample"])
         doubt = "not valid" if spoilt else validity(base)[3]
+        plain_tables = tables.parameters(base, doubt, "Parameters of the plain model", bounds_of(evidence.get("base", {})))
         yield section(
             "A fit to them as they are (not to be used)" if spoilt else "The plain model",
             part(text=sentence("" if spoilt else base["message"])),
-            *(part(table=t) for t in tables.parameters(base, doubt, "Parameters of the plain model")[: 1 if repaired else 2]),
+            *(part(table=t) for t in plain_tables[: 1 if repaired else 2]),
             part(table=tables.recordings(base)),
-            *([] if repaired else [sketch(best, plane.mass_map, best), sketch(best.get("inside"), loops.inside, best, drive)]),
+            *(
+                []
+                if repaired
+                else [
+                    part(text=plane.never_switched(best)),
+                    sketch(best, plane.mass_map, best),
+                    sketch(best.get("inside"), loops.inside, best, drive),
+                ]
+            ),
         )
 
 

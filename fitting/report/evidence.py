@@ -3,6 +3,7 @@
 Residuals are model less measurement.
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,7 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
         "against": by_field_and_rate(spectra, applied, scaled),
         "autocorrelation": autocorrelation(spectra, residuals),
         "plane": _plane(result),
+        "bounds": json.dumps({n: [float(i.low), float(i.high)] for n, (_, i) in result.actuator.parameters().items()}),
     }
     if inside:
         found["inside"] = {str(k): _inside(result.actuator, spectra[k]) for k in sorted(_extremes(result)[:INSIDE])}

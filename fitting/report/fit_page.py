@@ -1,5 +1,6 @@
 """The page of a fit: may it be trusted, what came out, how it meets each recording, what it leaves, what it holds inside."""
 
+import json
 import re
 
 from . import loops, misfit, plane, tables
@@ -53,7 +54,7 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
     sections = [
         section(
             "Parameters",
-            *(part(table=t) for t in (*tables.parameters(fit, doubt), *tables.intervals(fit))),
+            *(part(table=t) for t in (*tables.parameters(fit, doubt, bounds=bounds_of(evidence)), *tables.intervals(fit))),
             part(table=tables.correlations(fit)),
         ),
         section("Recordings", part(table=tables.recordings(fit))),
@@ -64,7 +65,7 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
             *headed("Zoom in time", sketch(evidence, loops.zoom, evidence, output)),
         ),
         residual_section(sketch, evidence, output),
-        section("The Preisach plane", sketch(evidence, plane.mass_map, evidence)),
+        section("The Preisach plane", part(text=plane.never_switched(evidence)), sketch(evidence, plane.mass_map, evidence)),
         section("Inside the model", sketch(evidence.get("inside"), loops.inside, evidence, drive)),
         section("How the fit went", convergence_part(sketch, fit), part(table=tables.numbers(fit))),
     ]
@@ -103,6 +104,11 @@ def _beside(folder: str) -> str:
     """A folder beside that of the fit, quoted as it was."""
     quote = folder[-1] if folder[-1] in "'\"" else ""
     return f"{folder.removesuffix(quote).rstrip('/')}-diagnosis{quote}"
+
+
+def bounds_of(evidence) -> dict:
+    """What values the parameters can have: name -> (lowest, highest); {} where the evidence does not hold it."""
+    return json.loads(str(evidence["bounds"])) if "bounds" in evidence else {}
 
 
 def residual_section(sketch, evidence, output, title: str = "What the fit leaves", with_map: bool = True):

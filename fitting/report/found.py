@@ -112,7 +112,7 @@ def ranking(candidates, stem: str = "ranking", count: int = 16):
                 axes.text(
                     1.01,
                     k,
-                    f"χ² fell by {plain(c['achieved_chi2_drop'])}",
+                    f"χ² {'fell' if c['achieved_chi2_drop'] >= 0 else 'rose'} by {plain(abs(c['achieved_chi2_drop']))}",
                     transform=axes.get_yaxis_transform(),
                     va="center",
                     fontsize=7.5,

@@ -10,8 +10,8 @@ SHOWN = 12  # check recordings
 LEGEND = 0.25  # inches
 
 
-def loops(evidence, output: str, drive: str, after=None, stem: str = "loops"):
-    """Measured and simulated loops with a residual strip each; `after`: the same of a repaired model."""
+def loops(evidence, output: str, drive: str, after=None, added: str = "", stem: str = "loops"):
+    """Measured and simulated loops with a residual strip each; `after`: the same of a repaired model, `added`: what it adds."""
     names, frequency = evidence["name"], evidence["frequency"]
     panels = []
     for k in evidence["chosen"]:
@@ -38,11 +38,11 @@ def loops(evidence, output: str, drive: str, after=None, stem: str = "loops"):
         "Above: the reading (mean of the periods) and the model against the drive. Below: model less measurement over one period, with "
         f"twice the noise of the mean as the band.{some}"
     )
-    return _panels(panels, output, drive, stem, title, caption, detail)
+    return _panels(panels, output, drive, stem, title, caption, detail, added)
 
 
-def checks(entries, output: str, drive: str, rows, repaired: bool = True, stem: str = "checks"):
-    """Check recordings: measured, predicted before and after, or by the one model that there is."""
+def checks(entries, output: str, drive: str, rows, repaired: bool = True, added: str = "", stem: str = "checks"):
+    """Check recordings: measured, predicted before and after, or by the one model that there is; `added`: as in `loops`."""
     panels = []
     for key, entry in list(entries.items())[:SHOWN]:
         row = rows[int(key)]
@@ -60,10 +60,10 @@ def checks(entries, output: str, drive: str, rows, repaired: bool = True, stem: 
         f"Recordings that took no part in any fit: the reading and its prediction{when}, and below them prediction less measurement with twice "
         "the noise of the mean as the band."
     )
-    return _panels(panels, output, drive, stem, f"Check recordings{when}", caption, "")
+    return _panels(panels, output, drive, stem, f"Check recordings{when}", caption, "", added)
 
 
-def _panels(panels, output, drive, stem, title, caption, detail):
+def _panels(panels, output, drive, stem, title, caption, detail, added=""):
     factor, label, fine, unit = scale_of(output)
     drive_factor, drive_name = drive_label(drive)
     columns = min(COLUMNS, max(len(panels), 1))
@@ -86,8 +86,10 @@ def _panels(panels, output, drive, stem, title, caption, detail):
                 upper.set_ylabel(label)
                 lower.set_ylabel(f"residual / {unit}")
             if k == 0:
-                lines, names = upper.get_legend_handles_labels()
-                figure.legend(lines, names, loc="upper left", bbox_to_anchor=(left, 1), ncols=3, borderaxespad=0, handlelength=2.5)
+                pairs = [p for axes in (upper, lower) for p in zip(*axes.get_legend_handles_labels(), strict=True)]
+                lines, names = zip(*pairs, strict=True)
+                names = [f"after, with {added}" if added and n == "after" else n for n in names]
+                figure.legend(lines, names, loc="upper left", bbox_to_anchor=(left, 1), ncols=4, borderaxespad=0, handlelength=2.5)
         return picture(figure, stem, title, caption, detail)
 
 
@@ -113,7 +115,7 @@ def _loop(axes, loop, drive_factor, factor, heading):
 
 def _strip(axes, loop, strips, fine):
     phase, band = loop["phase"], 2 * fine * loop["noise"]
-    axes.fill_between(phase, -band, band, color=PALE, lw=0)
+    axes.fill_between(phase, -band, band, color=PALE, lw=0, label="twice the noise")
     axes.axhline(0, color=MUTED, lw=0.5)
     styles = {"model": {"color": MODEL, "lw": 0.9}, "after": {"color": INK, "lw": 0.9}}
     for key, _, values in strips:

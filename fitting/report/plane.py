@@ -6,6 +6,17 @@ from matplotlib.colors import PowerNorm
 from .style import INK, MUTED, SEQUENTIAL, canvas, percent, picture, styled
 
 
+def never_switched(evidence) -> str:
+    """How much of the plane the recordings say nothing of, in words; "" where there is no evidence."""
+    if "plane" not in evidence:
+        return ""
+    seen = evidence["plane"]["seen"].astype(bool)
+    lower = np.tril(np.ones(seen.shape, bool))
+    blind = int((lower & ~seen).sum())
+    told = "their masses rest on smoothness alone" if blind else "every mass rests on recordings"
+    return f"{blind or 'None'} of the {int(lower.sum())} cells {'was' if blind == 1 else 'were'} never switched by any recording: {told}."
+
+
 def mass_map(evidence, stem: str = "masses"):
     """Masses (left) and their standard errors (right) over beta and alpha."""
     found = evidence["plane"]

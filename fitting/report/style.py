@@ -91,8 +91,8 @@ def percent(share: float) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """A unit with raised exponents."""
-    return unit.replace("^0.5", "^½").replace("^2", "²").replace("^3", "³").replace("^-1", "⁻¹")
+    """A unit with raised exponents; nothing for a number."""
+    return "" if unit == "1" else unit.replace("^0.5", "^½").replace("^2", "²").replace("^3", "³").replace("^-1", "⁻¹")
 
 
 def to_svg(figure: Figure, stem: str, title: str, description: str) -> str:

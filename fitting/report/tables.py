@@ -34,8 +34,17 @@ DOUBTS = {
 }
 
 
-def parameters(fit, doubt: str = "", caption: str = "Fitted parameters") -> list[dict]:
-    """Two tables: fitted parameters with errors and flags, and those held fixed; `doubt`: a key of DOUBTS."""
+def interval(p, low: float = -math.inf, high: float = math.inf) -> str:
+    """The 95 % interval of an estimate that cannot leave `low` to `high`."""
+    ends = p["value"] - 1.96 * p["stderr"], p["value"] + 1.96 * p["stderr"]
+    said = [f"{plain(bound)} (bound)" if beyond else to_error(end, p["stderr"])
+            for end, bound, beyond in ((ends[0], low, ends[0] < low), (ends[1], high, ends[1] > high))]  # fmt: skip
+    return " to ".join(said)
+
+
+def parameters(fit, doubt: str = "", caption: str = "Fitted parameters", bounds=None) -> list[dict]:
+    """Two tables: fitted parameters with errors and flags, and those held fixed; `doubt`: a key of DOUBTS; `bounds`: name ->
+    (lowest, highest)."""
     free, fixed = [], []
     for name, p in fit["parameters"].items():
         if name.startswith("effects.learned_term."):  # its function is drawn
@@ -43,26 +52,24 @@ def parameters(fit, doubt: str = "", caption: str = "Fitted parameters") -> list
         if not p["free"]:
             fixed.append([name, p.get("meaning", ""), plain(p["value"], 6), unit_text(p["unit"])])
             continue
-        spread = 1.96 * p["stderr"]
-        interval = f"{to_error(p['value'] - spread, p['stderr'])} to {to_error(p['value'] + spread, p['stderr'])}"
         row = [
             name,
             p.get("meaning", ""),
             plain(p.get("start"), 5),
             to_error(p["value"], p["stderr"]),
             plain(p["stderr"], 2),
-            interval,
+            interval(p, *(bounds or {}).get(name, ())),
             unit_text(p["unit"]),
             flags(p),
         ]
         free.append(row)
-    error, interval = (f"{name} ({doubt})" if doubt else name for name in ("std. error", "95 % interval"))
+    error, span = (f"{name} ({doubt})" if doubt else name for name in ("std. error", "95 % interval"))
     tables = []
     if free:
         tables.append(
             table(
                 caption,
-                ["parameter", "meaning", "start", "value", error, interval, "unit", "flags"],
+                ["parameter", "meaning", "start", "value", error, span, "unit", "flags"],
                 free,
                 DOUBTS[doubt],
                 code=True,

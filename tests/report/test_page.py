@@ -2,6 +2,7 @@
 
 import html.parser
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -10,9 +11,12 @@ import xml.dom.minidom
 import numpy as np
 import pytest
 
-from fitting.report import rebuild
-from fitting.report.diagnosis_page import _size, headline, interval, placebo_section
+from fitting.report import rebuild, store
+from fitting.report.diagnosis_page import _shifts, _size, headline, interval, placebo_section, tone
 from fitting.report.fit_page import diagnose_command, sentence, validity
+from fitting.report.plane import never_switched
+from fitting.report.tables import interval as interval_of
+from fitting.report.tables import to_error
 from magjax.errors import ConfigurationError
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
@@ -207,6 +211,81 @@ def test_the_verdict_comes_first_and_in_plain_words(folders, diagnoses):
     assert "sensor" in headline(diagnoses["unknown_at"].as_dict())
 
 
+def test_a_silent_headline_says_what_is_left(diagnoses, folders, tmp_path):
+    found = diagnoses["nothing_missing"].as_dict()
+    good = {**found, "base": {**found["base"], "chi2_per_sample": 1.0, "recordings": [{"chi2_per_sample": 1.2}]}}
+    assert headline(good) == "Nothing is missing: the model meets the recordings to their noise" and tone(good) == "good"
+    for wrong, said in (
+        ({"base": {**good["base"], "chi2_per_sample": 1.31}}, "χ²/N = 1.31 is left"),
+        ({"base": {**good["base"], "recordings": [{"chi2_per_sample": 2.5}]}}, "one recording is left with a misfit of χ²/N = 2.5"),
+        ({"check": [{"rms_after": 1.32e-7, "noise_rms": 4.9e-8, "unit": "m"}]}, "missed by 132 nm (noise 49 nm)"),
+    ):
+        bad = good | wrong
+        assert headline(bad).startswith("Nothing of the catalogue is missing; ") and said in headline(bad) and tone(bad) == "warn"
+    stored = json.loads((folders["nothing_missing"] / "diagnosis.json").read_text())
+    stored["base"]["chi2_per_sample"] = 1.31
+    (tmp_path / "diagnosis.json").write_text(json.dumps(stored))
+    page = rebuild(tmp_path).read_text(encoding="utf-8")
+    assert 'class="banner warn"' in page and "the model meets" not in page
+
+
+def test_what_was_found_beside_a_group_is_in_its_headline_and_its_leader_has_shifts(diagnoses):
+    found = diagnoses["group"].as_dict()
+    beside = {**diagnoses["attributed"].effects[0], "name": "second_mode", "block": "mechanics"}
+    assert headline(found | {"effects": [beside]}) == headline(found) + "; found beside it: second mode (mechanics)"
+    told = json.dumps(_shifts(found), ensure_ascii=False)
+    base, repaired = (found[k]["parameters"]["coil.R_eddy"] for k in ("base", "repaired"))
+    assert to_error(base["value"], repaired["stderr"]) in told and to_error(repaired["value"], repaired["stderr"]) in told
+    assert f"if the leading rival is right: {found['groups'][0][0].replace('_', ' ')}" in told
+    rows = _shifts(found | {"effects": [beside, {**beside, "name": "creep"}]})["parts"][0]["table"]["rows"]
+    assert [row[0] for row in rows] == list(beside["shifts"])  # each constant once, however many effects
+
+
+def test_the_ranking_says_what_a_fit_did_and_no_power_of_what_is_absorbed(diagnoses, folders, tmp_path):
+    found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
+    found["candidates"][1]["achieved_chi2_drop"] = -947.0
+    found["absorbed"] = [found["candidates"][2]["name"]]
+    shutil.copy(folders["attributed"] / "report.npz", tmp_path)
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    page = rebuild(tmp_path).read_text(encoding="utf-8")
+    assert page.count("rose by 947") == 2 and "−947" not in page and "by −" not in page
+    rows = [[cell for cell in re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row)] for row in re.findall("<tr>.*?</tr>", page)]
+    power = {row[0]: row[6] for row in rows if len(row) == 10}
+    name = found["absorbed"][0].replace("_", " ")
+    assert power[name] == "–" and sum(p.endswith("%") for p in power.values()) > 10
+
+
+def test_loops_say_what_was_added_and_what_the_band_is(diagnoses, folders, tmp_path):
+    found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
+    found["repaired"]["parameters"]["effects.excess_loss.k"] = {**found["repaired"]["parameters"]["mechanics.xi"], "unit": "1"}
+    shutil.copy(folders["attributed"] / "report.npz", tmp_path)
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    page = rebuild(tmp_path).read_text(encoding="utf-8")
+    assert page.count(">after, with excess loss</text>") == 2 and page.count(">twice the noise</text>") == 2
+    assert ">1</td>" not in page.split("Parameters of the repaired model")[2].split("</table>")[0]  # a number has no unit
+
+
+def test_a_fit_says_how_many_cells_were_never_switched(folders):
+    evidence = store.load(folders["fit"])
+    said = never_switched(evidence)
+    assert said and said in (folders["fit"] / "report.html").read_text(encoding="utf-8")
+    lower = np.tril(np.ones((4, 4), bool))
+    assert never_switched({"plane": {"seen": lower}}).startswith("None of the 10 cells were never switched")
+    assert never_switched({"plane": {"seen": lower & ~np.eye(4, dtype=bool)}}).startswith("4 of the 10 cells were never switched")
+    assert never_switched({}) == ""
+
+
+def test_an_interval_ends_at_the_bounds_of_its_parameter(folders, tmp_path):
+    assert interval_of({"value": 5.9, "stderr": 3.2}, 0.0) == "0 (bound) to 12.2"
+    assert interval_of({"value": 0.9, "stderr": 0.1}, 0.0, 1.0) == "0.7 to 1 (bound)"
+    assert interval_of({"value": 5.9, "stderr": 3.2}) == "−0.37 to 12.2"
+    fit = json.loads((folders["fit"] / "fit.json").read_text())
+    fit["parameters"]["mechanics.xi"]["stderr"] = 2.0
+    shutil.copy(folders["fit"] / "report.npz", tmp_path)
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    assert "0 (bound) to 4" in rebuild(tmp_path).read_text(encoding="utf-8")
+
+
 def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
     page = (folders["attributed"] / "report.html").read_text(encoding="utf-8")
     heads = [e[2] for e in Outline(page).all("h2")]
@@ -219,7 +298,7 @@ def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
         "Where simulation and recordings differ",
         "Fitted recordings, before and after",
         "Parameter shifts",
-        "Placebo: would the search cry wolf?",
+        "False alarms of the screening",
     ):
         assert title in heads
     assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
@@ -242,8 +321,9 @@ def test_a_misfit_that_is_no_number_is_never_a_verdict(folders, tmp_path):
 def test_the_placebo_panel():
     said = placebo_section({"runs": 20, "false_alarms": 1, "named": {"creep": 1}}, "attributed")
     text = json.dumps(said)
-    assert "20 searches" in text and "1 named" in text and "creep: 1" in text
-    assert "Not run" in json.dumps(placebo_section(None, "attributed"))
+    assert "1 of 20 sets" in text and "creep: 1" in text
+    assert "screening" in text and "An alarm names nothing yet" in text and "searches" not in text  # no rivals were fitted
+    assert "Not tried" in json.dumps(placebo_section(None, "attributed"))
     assert placebo_section(None, "data_problem") is None
     low, high = interval(0, 20)
     assert low == 0 and high == pytest.approx(0.161, abs=2e-3)  # Wilson: z^2 / (n + z^2)
@@ -260,8 +340,6 @@ def test_messages_read_as_sentences():
 
 def test_many_recordings_stay_below_a_megabyte(folders, tmp_path):
     """Twelve drawn of forty, each with noise of its own, before and after, and twelve check recordings."""
-    from fitting.report import store
-
     found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
     evidence = store.load(folders["attributed"])
     rng = np.random.default_rng(0)
