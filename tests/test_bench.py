@@ -8,6 +8,7 @@ import pytest
 
 from fitting.result import model_as_dict
 from magjax.bench import built_in_benches, load_bench
+from magjax.cli import main
 from magjax.errors import ConfigurationError
 from magjax.model_file import load_model
 from magjax.preisach import Preisach
@@ -51,8 +52,6 @@ def written(folder, text):
         ('[fit.priors]\n"coil.R_eddy" = "x"', "must be a finite number"),
         (COIL.replace("70", "nan"), "coil.R_eddy = nan must be a finite number"),
         (COIL.replace("70", "inf"), "coil.R_eddy = inf must be a finite number"),
-        (COIL.replace("c0 = 1.54e4\n", ""), r"\[coil\] lacks c0"),
-        (COIL + ROD + "[mechanics]\nf0 = 392", r"\[mechanics\] lacks xi"),
         (COIL + "[mechanics]\nf0 = 392\nxi = 1", r"without \[magnetostriction\]"),
         (COIL + "k_eddy = 0.1", "coil.R_eddy does nothing beside coil.k_eddy"),
         ("[hysteresis]\nstart = [1.0, 'x']", r"hysteresis.start\[1\] = 'x'"),
@@ -80,9 +79,18 @@ def test_a_prior_may_be_written_with_or_without_quotes(tmp_path):
         assert load_bench(written(tmp_path, f"\ufeff{COIL}[fit.priors]\n{name} = 2")).priors == {"coil.R_eddy": 2.0}
 
 
+def test_constants_that_are_not_stated_are_told(tmp_path, capsys):
+    path = written(tmp_path, COIL.replace("c0 = 1.54e4\n", "") + ROD + "[mechanics]\nf0 = 392")
+    assert load_bench(path).assumed == ("coil.c0", "mechanics.xi")
+    main(["simulate", "--bench", str(path), "--frequency", "10", "--amplitude", "0.1", "--out", str(tmp_path / "run.nc")])
+    said = capsys.readouterr().err
+    assert "does not state coil.c0 (15400 1/m), mechanics.xi (0.7783)" in said and str(path) in said
+
+
 def test_built_in_benches_hold():
     for name in built_in_benches():
         bench = load_bench(name)
+        assert not bench.assumed
         assert bench.output == "strain" or bench.actuator().hysteresis.cells == bench.levels
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from magjax.errors import ConfigurationError, MagjaxError
 
-from .runtime import Progress, output_folder, parser, prepare_jax
+from .runtime import Progress, output_folder, parser, prepare_jax, told
 from .scale import add_intervals, check_intervals, intervals, run_fleet
 
 
@@ -28,10 +28,10 @@ def _bench_and_start(options):
         from magjax.model_file import load_model
 
         actuator, bench = load_model(options.model)
-        return (load_bench(options.bench) if options.bench else bench), actuator
+        return (told(load_bench(options.bench)) if options.bench else bench), actuator
     if not options.bench:
         raise ConfigurationError("give --bench (a TOML file or aa-050h), or --model with a fitted folder")
-    return load_bench(options.bench), None
+    return told(load_bench(options.bench)), None
 
 
 def _common(command, text, example, recordings="+"):

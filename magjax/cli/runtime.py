@@ -77,6 +77,15 @@ def output_folder(path) -> Path | None:
     return folder
 
 
+def told(bench):
+    """The bench; what its file does not state, and what stands in for it, is told on stderr."""
+    if bench.assumed:
+        known = bench.actuator().parameters()
+        rows = [f"{n} ({float(known[n][0]):g}{'' if known[n][1].unit == '1' else ' ' + known[n][1].unit})" for n in bench.assumed]
+        print(f"bench {bench.source}: does not state {', '.join(rows)}; taken from T&B's bench: write yours", file=sys.stderr)
+    return bench
+
+
 class Progress:
     """What a long step reports, called as progress(text, step, chi2 per datum): the words of the command's spinner."""
 

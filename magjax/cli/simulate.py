@@ -5,7 +5,7 @@ import json
 
 from magjax.errors import ConfigurationError
 
-from .runtime import Progress, output_folder, parser, prepare_jax
+from .runtime import Progress, output_folder, parser, prepare_jax, told
 from .scale import add_where, executor_of
 
 
@@ -21,7 +21,7 @@ def _actuator(options):
         return load_model(options.model)
     from magjax.bench import load_bench
 
-    bench = load_bench(options.bench or "aa-050h")
+    bench = told(load_bench(options.bench or "aa-050h"))
     return bench.actuator(), bench
 
 
