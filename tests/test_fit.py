@@ -9,6 +9,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
+from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import cell_basis, hat_basis
 from fitting.fit import fit, loose
@@ -21,6 +22,7 @@ from magjax.bench import load_bench
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.preisach import Preisach
 from magjax.recording import Recording
+from tests.studies.joint_fit import NAMES, SINES, TRUTH, one_draw, settled
 
 TRUE = {"coil.R_eddy": 62.0, "mechanics.xi": 0.81, "mechanics.f0": 405.0}
 QUICK = Choices(fine=250)
@@ -224,6 +226,17 @@ def test_unfold_finds_the_sign_of_M():
     # the one sample beside the crossing may fall on either side
     assert unfold(np.abs(M), drive) == pytest.approx(M, abs=0.035)
     assert unfold(np.abs(drive + 3), drive) == pytest.approx(drive + 3)
+
+
+def test_what_an_independent_bench_does_elsewhere_is_foretold(bench):
+    """A draw of `tests.studies.joint_fit`, four of its sines: another frequency, a multisine, a modulated sine to 1.5 of their noise."""
+    recordings, start = one_draw(settled("gauss"), 0)
+    some = [recordings[k] for k in (0, 2, 5, 8)]  # as many as above: the same programs serve
+    got = fit(some, bench, actuator=bench.actuator().replace(start), choices=QUICK, refine=False)
+    assert got.converged and got.chi2_per_sample < 1.1
+    assert all(abs(got.estimate(n).value - TRUTH[short]) < 3 * got.estimate(n).stderr for n, short in NAMES.items())
+    rows = check_errors(got.actuator, got.actuator, recordings[len(SINES) :], bench)
+    assert len(rows) == 3 and all(row["rms_after"] < 1.5 * row["noise_rms"] for row in rows)
 
 
 @pytest.mark.long
