@@ -1,8 +1,11 @@
 """`python -m tests.benchmarks.run [NAME ...]`: every ratio of the README's table, in one run, kept in results.json."""
 
 import json
+import os
 import resource
+import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -124,7 +127,7 @@ def static():
     field = 1.2e4 + 1.1e4 * np.sin(np.arange(T) * 0.02) * np.linspace(1, 0.3, T) + 800 * np.sin(np.arange(T) * 0.13)
     path = static_path(field, -2e3)
     found = {}
-    for level in (25, 200):
+    for level in (25, 50, 100, 200):
         h = actuator_at(level).hysteresis
         run = static_value_and_gradient(lambda M: jnp.sum(M**2), h.low, h.high, h.offset, path)
         stream = jax.jit(
@@ -137,17 +140,58 @@ def static():
 
 
 def memory():
-    """Peak memory of value and gradient where the field is known, T = 1e6, MB: grown over that of a short path."""
+    """Memory of value and gradient where the field is known, MB: of the program at T = 10,000; at T = 1e6 what the process grew."""
     from magjax.preisach.static import static_path, static_value_and_gradient
 
+    found, grown = {}, {}
     h = actuator_at(100).hysteresis
-    found = {}
     for T in (1000, 1_000_000):
         field = 1.2e4 + 1.1e4 * np.sin(np.arange(T) * 0.02)
         run = static_value_and_gradient(lambda M: jnp.sum(M**2), h.low, h.high, h.offset, static_path(field, -2e3))
         jax.block_until_ready(run(h.masses))
-        found[T] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"T = 1e6: peak memory grown by, MB (bar < 500)": found[1_000_000] - found[1000]}
+        grown[T] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    found["T = 1e6: peak memory grown by, MB (bar < 500)"] = grown[1_000_000] - grown[1000]
+
+    @jax.jit
+    def whole(masses, h, path):
+        return static_value_and_gradient(lambda M: jnp.sum(M**2), h.low, h.high, h.offset, path)(masses)
+
+    field = 1.2e4 + 1.1e4 * np.sin(np.arange(10_000) * 0.02) * np.linspace(1, 0.3, 10_000)
+    for level in (25, 200):
+        h = actuator_at(level).hysteresis
+        used = whole.lower(h.masses, h, static_path(field, -2e3)).compile().memory_analysis()
+        bytes_ = used.temp_size_in_bytes + used.argument_size_in_bytes + used.output_size_in_bytes
+        found[f"T = 10,000, L = {level}: memory, MB (bar <= 20)"] = bytes_ / 2**20
+    return found
+
+
+ONE_FIT = """
+import json, time
+from magjax.cli.runtime import prepare_jax
+prepare_jax()
+from fitting.fit import fit
+from magjax.bench import load_bench
+from tests.studies.joint_fit import SINES, one_draw, settled
+recordings, start = one_draw(settled("gauss"), 0)
+bench = load_bench("aa-050h")
+begin = time.perf_counter()
+found = fit(recordings[: len(SINES)], bench, actuator=bench.actuator().replace(start))
+print(json.dumps({"whole": time.perf_counter() - begin, "compile": found.compile_s, "solve": found.solve_s, "chi2n": found.chi2_per_sample}))
+"""
+
+
+def joint_fit():
+    """Nine recordings of a bench of the independent generator, each time by a fresh process: nothing kept, then what the first kept."""
+    with tempfile.TemporaryDirectory() as cache:
+        command, env = [sys.executable, "-c", ONE_FIT], {**os.environ, "MAGJAX_CACHE": cache}
+        cold, cached = (
+            json.loads(subprocess.run(command, env=env, check=True, capture_output=True, text=True).stdout) for _ in range(2)
+        )
+    return {
+        "cold: compilation, s (bar <= 5)": cold["compile"], "cached: compilation, s (bar <= 2)": cached["compile"],
+        "solve, s (bar <= 3)": cached["solve"], "chi2/N (bar < 1.1)": cached["chi2n"],
+        "cold: whole fit, s": cold["whole"], "cached: whole fit, s": cached["whole"],
+    }  # fmt: skip
 
 
 def grid():
@@ -215,12 +259,17 @@ GROUPS = {
     "sweep": grid,
     "inversion": inversion,
     "l1": l1,
+    "fit": joint_fit,
 }
 
 
 def main():
     """Run the groups named, or all; print and keep."""
     names = sys.argv[1:] or list(GROUPS)
+    if len(names) > 1:  # each in a process of its own: the peak memory of one would hide what another needs
+        for name in names:
+            subprocess.run([sys.executable, "-m", "tests.benchmarks.run", name], check=True)
+        return
     found = {}
     for name in names:
         found[name] = {k: float(v) for k, v in GROUPS[name]().items()}
