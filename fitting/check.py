@@ -13,7 +13,7 @@ def prediction(actuator, recording, bench):
     """(predicted, measured, noise rms) over the recording's samples. Periodic drives settle first; others start at rest."""
     measured = np.asarray(recording.channels[bench.output], float)
     if recording.frequency() is None:
-        signals = simulate(actuator, recording.channels[bench.drive], recording.dt)
+        signals = simulate(actuator, recording.channels[bench.drive], recording.dt, outside="saturate")  # told by `beyond_plane`
         return np.asarray(signals.reading), measured, None
     s = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
     corners = int(4 * np.ceil(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) / 4))
@@ -24,6 +24,16 @@ def prediction(actuator, recording, bench):
     if bench.output == "flux_density":
         measured = measured - measured.mean() + predicted.mean()
     return predicted, measured, s.noise_rms
+
+
+def beyond_plane(actuator, recording, bench) -> float:
+    """How far a recording's drive leads the applied field out of the fitted plane, as a share of the plane: 0 where it does not.
+
+    Out there every relay of the model is saturated: nothing is known of them.
+    """
+    field = np.asarray(actuator.coil.applied_field(np.asarray(recording.channels[bench.drive], float)))
+    low, high = float(actuator.hysteresis.low), float(actuator.hysteresis.high)
+    return max(low - float(field.min()), float(field.max()) - high, 0.0) / (high - low)
 
 
 def check_errors(before, after, recordings, bench, cleaned=None) -> list[dict]:
@@ -39,6 +49,7 @@ def check_errors(before, after, recordings, bench, cleaned=None) -> list[dict]:
             errors.append(float(np.sqrt(np.mean((predicted - measured) ** 2))))
         rows.append(
             {"file": recording.origin.get("file", recording.name), "channel": bench.output, "unit": unit,
-             "rms_before": errors[0], "rms_after": errors[1], "noise_rms": noise if noise is not None else 0.0}
+             "rms_before": errors[0], "rms_after": errors[1], "noise_rms": noise if noise is not None else 0.0,
+             "beyond_plane": beyond_plane(after, recording, bench)}
         )  # fmt: skip
     return rows

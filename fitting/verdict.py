@@ -15,6 +15,7 @@ from .attribute import MISFIT, chi2_of, confidence
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .instruments import exchange
+from .reach import beyond_text
 
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 Z_THRESHOLD = 5.5  # about forty columns are looked at
@@ -51,7 +52,11 @@ class Diagnosis:
     placebo: dict | None = None
 
     def __str__(self):
-        return f"{self.verdict}: {self.message}"
+        return f"{self.verdict}: {self._said()}"
+
+    def _said(self) -> str:
+        """The message, and where check recordings ask for more than was fitted."""
+        return f"{self.message} {beyond_text(self.check)}".strip()
 
     def as_dict(self) -> dict:
         """The content of diagnosis.json."""
@@ -67,7 +72,7 @@ class Diagnosis:
             "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
             "rivals": self.rivals, "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
             "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
-            "placebo": self.placebo, "message": self.message, "base": self.base.as_dict() if self.base else None,
+            "placebo": self.placebo, "message": self._said(), "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
         }  # fmt: skip
 

@@ -134,13 +134,15 @@ def simulate(
     tolerance: float = TOLERANCE,
     corners=None,
     scheme=None,
+    outside: str = "refuse",
 ) -> Signals:
     """Simulate the actuator.
 
     `current`: (time,), A (applied field, A/m, on a field-driven bench). `dt`: s. `periodic`: the samples are one period
     (or several whole ones) of a steady drive, repeated until two repetitions differ by less than `tolerance` of the peak to
     peak of H + M (`MOST_PERIODS` at most: `unsettled` of the result tells what is left), or exactly `settle` times before
-    the one that is returned. `corners`: room for the memory, found from the drive if None. Raises `ConfigurationError` for NaN, a drive outside the plane, or a lost corner.
+    the one that is returned. `corners`: room for the memory, found from the drive if None.
+    `outside`: "refuse" a drive that leaves the plane, or "saturate" there. Raises `ConfigurationError` for NaN, a drive outside the plane, or a lost corner.
 
     >>> import jax, numpy as np; jax.config.update("jax_enable_x64", True)
     >>> from magjax.bench import load_bench
@@ -168,8 +170,9 @@ def simulate(
         signals = _run(actuator, *steps, (settle + 1) if periodic else 0, needed, scheme)
     if bool(signals.overflow):
         raise ConfigurationError(f"the drive leaves more than {needed} nested corners in the memory; raise corners")
-    reached = np.asarray(signals.relay_field)
-    _refuse_outside(actuator, reached.min(), reached.max())
+    if outside != "saturate":
+        reached = np.asarray(signals.relay_field)
+        _refuse_outside(actuator, reached.min(), reached.max())
     return signals
 
 

@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+from ..reach import beyond_text
 from .style import plain, scale_of, unit_text
 
 CHANNEL_OF = {"m": "displacement", "T": "flux_density", "A/m": "magnetization"}
@@ -133,7 +134,7 @@ def checks(rows, repaired: bool = True) -> dict:
         )
     when = (" before", " after") if repaired else ("",)
     head = ["recording", *(f"rms error{w}" for w in when), "noise rms", *(f"beyond noise{w}" for w in when), "unit"]
-    note = "Beyond noise: the root of what the squared error exceeds the squared noise by."
+    note = f"Beyond noise: the root of what the squared error exceeds the squared noise by. {beyond_text(rows)}".strip()
     return table("Errors of prediction", head, body, note, code=True)
 
 
