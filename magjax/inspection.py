@@ -4,33 +4,50 @@ import dataclasses
 
 import numpy as np
 
+from .clipping import quantum
+from .errors import RecordingError
+from .plausibility import STRONG_FIELD
+
+MOST_FILLED = 0.05  # of the samples: more is no measurement
+WIDEST_FILLED = 0.25  # of a period, in one gap
+
 
 @dataclasses.dataclass(frozen=True)
 class Card:
-    """What was found: `facts` name -> text, `problems`: sentences with their mend."""
+    """What was found: `facts` name -> text, `problems` and `warnings`: sentences with their mend; with a problem it is unfit."""
 
     name: str
     facts: dict
     problems: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
     def as_dict(self) -> dict:
         """For --json."""
-        return {"recording": self.name, "facts": self.facts, "problems": list(self.problems), "usable": not self.problems}
+        return {
+            "recording": self.name,
+            "facts": self.facts,
+            "problems": list(self.problems),
+            "warnings": list(self.warnings),
+            "usable": not self.problems,
+        }
 
     def __str__(self):
         rows = [f"{self.name}: {'fit to use' if not self.problems else 'NOT fit to use'}"]
         rows += [f"  {k:22s} {v}" for k, v in self.facts.items()]
-        return "\n".join(rows + [f"  problem: {p}" for p in self.problems])
+        return "\n".join(rows + [f"  problem: {p}" for p in self.problems] + [f"  warning: {w}" for w in self.warnings])
 
 
-def quantum(values: np.ndarray) -> float:
-    """The step of a quantised channel, 0 where it is not quantised."""
-    steps = np.diff(np.unique(values))
-    if len(steps) < 3:
-        return float(steps.min()) if len(steps) else 0.0
-    smallest = float(np.quantile(steps, 0.1))
-    ratio = steps / smallest
-    return smallest if np.mean(np.abs(ratio - np.round(ratio)) < 0.05) > 0.9 and smallest > 0 else 0.0
+def inspect_files(paths, bench) -> list[Card]:
+    """A card of every recording in every file; of a file that cannot be read, one whose problem says why."""
+    from .readers import load_recordings
+
+    cards = []
+    for path in paths:
+        try:
+            cards += [inspect(r, bench) for r in load_recordings([path], bench)]
+        except RecordingError as error:
+            cards.append(Card(str(path), {}, (str(error),)))
+    return cards
 
 
 def channel_lag(drive: np.ndarray, reading: np.ndarray, dt: float) -> float:
@@ -45,7 +62,7 @@ def inspect(recording, bench) -> Card:
     x = np.asarray(recording.channels[bench.drive])
     y = np.asarray(recording.channels[bench.output])
     f = recording.frequency()
-    facts, problems = {}, []
+    facts, problems, warnings = {}, [], []
     facts["samples"] = f"{len(x)} at {recording.dt:.6g} s ({len(x) * recording.dt:.4g} s)"
     facts["drive"] = f"{bench.drive} {x.min():.5g} .. {x.max():.5g}"
     facts["reading"] = f"{bench.output} {y.min():.5g} .. {y.max():.5g}"
@@ -55,12 +72,21 @@ def inspect(recording, bench) -> Card:
             facts[f"{name} counts"] = f"step {step:.3g}, {np.ptp(v) / step:.0f} steps over the range"
             if np.ptp(v) / step < 40:
                 problems.append(f"{name} spans only {np.ptp(v) / step:.0f} counts; raise the gain of the converter")
+    _judge_gaps(recording, f, facts, problems, warnings)
     if f is None:
         facts["periods"] = "aperiodic: usable as a check recording, not in a fit"
     else:
         facts["fundamental"] = f"{f:.6g} Hz, {len(x) * recording.dt * f:.3f} periods of {1 / (f * recording.dt):.2f} samples"
         facts["lag of the reading"] = f"{channel_lag(x, y, recording.dt) * 1e3:.4g} ms"
         _judge_repeats(recording, x, y, f, facts, problems)
+        if (stated := recording.contradicted_frequency()) is not None:
+            warnings.append(
+                f"the header says {stated:g} Hz, the drive repeats at {f:.6g} Hz and is believed; mend `# frequency_Hz`"
+            )
+        if recording.noise_is_a_guess(bench.output):
+            warnings.append(
+                "less than two periods: a fit can only guess the noise from the high orders, and its errors with it; record three or more"
+            )
     H = _applied(bench, x)
     facts["visited plane"] = f"applied field {H.min():.5g} .. {H.max():.5g} A/m"
     whole = _plane(bench)
@@ -68,9 +94,33 @@ def inspect(recording, bench) -> Card:
         share = min((H.max() - H.min()) / (whole[1] - whole[0]), 1.0) ** 2
         facts["visited plane"] += f", {share:.0%} of the relays that the bench's limits reach"
     limit = bench.limits.get("current_A" if bench.drive == "current" else "field_A_per_m")
-    if limit and np.abs(x).max() > 1.02 * limit:
-        facts["limit"] = f"the drive passes the bench's limit of {limit:g}; widen [limits] if that is meant"
-    return Card(recording.name, facts, tuple(problems))
+    peak, unit = float(np.abs(x).max()), {"current": "A", "field": "A/m"}.get(bench.drive, "")
+    if limit and peak > 1.02 * limit:
+        warnings.append(
+            f"the drive reaches {peak:.4g} {unit}, the bench's limit is {limit:g} {unit}; check the column's unit, or widen [limits] if that is meant"
+        )
+    elif bench.drive == "current" and "coil.c0" in bench.constants and np.abs(H).max() > STRONG_FIELD:
+        warnings.append(
+            f"{peak:.4g} A make {np.abs(H).max():.3g} A/m by the bench's c0, far more than saturates the rod; "
+            "if the column is in mA, name it current_mA, and state [limits] current_A in the bench"
+        )
+    return Card(recording.name, facts, tuple(problems), tuple(warnings))
+
+
+def _judge_gaps(recording, f, facts, problems, warnings):
+    metadata = recording.origin.get("metadata", {})
+    filled, widest = (int(metadata.get(k) or 0) for k in ("bridged_samples", "widest_gap_samples"))
+    if not filled:
+        return
+    share = filled / len(recording.time)
+    facts["gaps"] = f"{filled} samples missing ({share:.2g} of all), filled from the harmonics of the rest" + (
+        f"; the widest gap is {widest} samples" if widest else ""
+    )
+    # captures that are joined stand in for each other: there the widest gap is not told
+    if widest and (share > MOST_FILLED or widest * recording.dt * (f or 0.0) > WIDEST_FILLED):
+        problems.append(f"{facts['gaps']}: too much to be called measured; record again")
+    else:
+        warnings.append(f"{filled} missing samples were filled; look for the recorder's drops if they come often")
 
 
 def _applied(bench, x):

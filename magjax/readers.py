@@ -7,26 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from .bench import load_bench
+from .clipping import refuse_clipping
 from .errors import ConfigurationError, MagjaxError, RecordingError
 from .pickup import bridge_gaps, integrate_emf, merge_captures
-from .recording import Recording
+from .plausibility import UNITS, ZERO, check_sizes
+from .recording import BYSTANDERS, Recording, refuse_constant
 
-UNITS = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
-    "current": {"A": 1.0, "mA": 1e-3},
-    "command": {"A": 1.0, "mA": 1e-3},
-    "field": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3, "Oe": 1e3 / (4 * np.pi)},
-    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
-    "reference": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
-    "flux_density": {"T": 1.0, "mT": 1e-3, "G": 1e-4},
-    "magnetization": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3},
-    "voltage": {"V": 1.0, "mV": 1e-3},
-    "temperature": {"degC": 1.0, "K": 1.0},
-    "strain": {"1": 1.0, "ppm": 1e-6},
-    "stress": {"Pa": 1.0, "MPa": 1e6},
-}
-# what no bench of this kind exceeds: (largest sensible absolute value, usual wrong unit)
-SENSIBLE = {"current": (60.0, "mA"), "displacement": (5e-3, "um"), "flux_density": (4.0, "mT"), "field": (5e6, "Oe")}
+TEXT = (".csv", ".txt", ".dat", ".tsv", "")  # read as CSV
 
 
 def load_recordings(paths, bench) -> list[Recording]:
@@ -56,6 +43,7 @@ def load_calibrations(paths, bench) -> list[Recording]:
         for table, metadata in _read_table(path):
             wanted = ("time", "reference", bench.output)
             columns = {q: _find(path, table, q, bench.columns.get(q, {}), required=True) for q in wanted}
+            refuse_constant(path.name, bench.output, columns[bench.output])
             time, channels, _ = bridge_gaps(columns["time"] - columns["time"][0], {q: columns[q] for q in wanted[1:]}, "reference")
             found.append(
                 Recording(time, channels, {}, {**origin, "metadata": {k: _number(v) for k, v in metadata.items()}}, path.name)
@@ -86,7 +74,12 @@ def _read_table(path: Path) -> list:
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty; record again")
     suffix = path.suffix.lower()
-    reader = {".nc": _read_netcdf, ".mat": _read_mat, ".mjlog": _read_log}.get(suffix, _read_csv)
+    readers = {".nc": _read_netcdf, ".mat": _read_mat, ".mjlog": _read_log} | dict.fromkeys(TEXT, _read_csv)
+    if suffix not in readers:
+        raise RecordingError(
+            f"{path}: files ending in {suffix} are not read; give {', '.join(s for s in readers if s)} (magjax export writes .nc, .csv, .mat)"
+        )
+    reader = readers[suffix]
     try:
         return reader(path) if suffix == ".mjlog" else [reader(path)]
     except MagjaxError:
@@ -189,8 +182,7 @@ def _parse(name):
 
 def _recordings(path, table, origin, bench) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
-    columns, available = {}, list(table)
-    quantities = {bench.drive, bench.output, *[q for q in bench.columns if q != "time"]}
+    columns, units, available = {}, {}, list(table)
     for quantity in (
         "time",
         "voltage",
@@ -205,10 +197,9 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         column = bench.columns.get(quantity, {})
         found = _find(path, table, quantity, column, required=quantity in (bench.drive, bench.output))
         if found is not None:
-            columns[quantity] = found
+            columns[quantity], units[quantity] = found, _column(table, quantity, column)[1]
     if not bench.columns.get("time", {}).get("quasistatic") and "time" not in columns:
         raise RecordingError(f"{path}: no time column among {', '.join(available)}; name one time_s or map it in [columns.time]")
-    del quantities
     if split is not None:
         if split not in table:
             raise RecordingError(f"{path}: no column {split} to split at; the file has {', '.join(available)}")
@@ -216,43 +207,56 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         parts = [(f"{path.name}[{split}={label:g}]", table[split] == label) for label in labels]
     else:
         parts = [(path.name, np.ones(len(next(iter(table.values()))), bool))]
+    if not bench.columns.get("time", {}).get("quasistatic"):
+        for name, rows in parts:
+            _refuse_clipping(name, {q: v[rows] for q, v in columns.items()}, bench)
     if bench.columns.get("time", {}).get("merge"):
         columns, filled = merge_captures([{q: v[rows] for q, v in columns.items()} for _, rows in parts], bench, path)
         if filled:
             origin = {**origin, "metadata": {**origin["metadata"], "bridged_samples": filled}}
-        return [_one(path.name, columns, origin, bench)]
-    return [_one(name, {q: v[rows] for q, v in columns.items()}, origin, bench) for name, rows in parts]
+        return [_one(path.name, columns, units, origin, bench)]
+    return [_one(name, {q: v[rows] for q, v in columns.items()}, units, origin, bench) for name, rows in parts]
+
+
+def _refuse_clipping(name, columns, bench):
+    """Clipping is seen in what the converter read: before gaps are filled, captures joined or an emf is integrated."""
+    for quantity, values in columns.items():
+        if quantity not in ("time", *BYSTANDERS):
+            what = f"the emf of {quantity}" if "emf_turns" in bench.columns.get(quantity, {}) else quantity
+            refuse_clipping(name, what, values, None if quantity == bench.drive else columns[bench.drive])
+
+
+def _column(table, quantity, column):
+    """(name, unit) of a quantity's column, as mapped by the bench or by its name; (None, None) where there is none."""
+    if "name" in column:
+        return (column["name"], column.get("unit")) if column["name"] in table else (None, None)
+    return next(((n, _parse(n)[1]) for n in table if _parse(n)[0] == quantity), (None, None))
 
 
 def _find(path, table, quantity, column, required):
-    if "name" in column:
-        if column["name"] not in table:
-            if not required:
-                return None
-            raise RecordingError(f"{path}: no column {column['name']}; the file has {', '.join(table)} (see [columns.{quantity}])")
-        values, unit = table[column["name"]], column.get("unit")
-    else:
-        matches = [n for n in table if _parse(n)[0] == quantity]
-        if not matches:
-            if required:
-                usual = {
-                    "current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm", "time": "time_s",
-                    "reference": "reference_m",
-                }.get(quantity, "flux_density_T")  # fmt: skip
-                raise RecordingError(
-                    f"{path}: no {quantity} column among {', '.join(table)}; name it {usual} or map it in [columns.{quantity}] of the bench"
-                )
+    name, unit = _column(table, quantity, column)
+    if name is None:
+        if not required:
             return None
-        values, unit = table[matches[0]], _parse(matches[0])[1]
-    factor = 1.0
+        if "name" in column:
+            raise RecordingError(f"{path}: no column {column['name']}; the file has {', '.join(table)} (see [columns.{quantity}])")
+        usual = {
+            "current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm", "time": "time_s",
+            "reference": "reference_m",
+        }.get(quantity, "flux_density_T")  # fmt: skip
+        raise RecordingError(
+            f"{path}: no {quantity} column among {', '.join(table)}; name it {usual} or map it in [columns.{quantity}] of the bench"
+        )
+    values, factor = np.asarray(table[name], float), 1.0
     if unit is not None and "emf_turns" not in column:
         if unit not in UNITS[quantity]:
             raise ConfigurationError(f'columns.{quantity}.unit = "{unit}" is unknown; write one of {", ".join(UNITS[quantity])}')
         factor = UNITS[quantity][unit]
-    return (np.asarray(values, float) * float(column.get("scale", 1.0)) + float(column.get("offset", 0.0))) * factor
+    zero = ZERO.get((quantity, unit), 0.0)
+    return (values * float(column.get("scale", 1.0)) + float(column.get("offset", 0.0))) * factor + zero
 
 
-def _one(name, columns, origin, bench) -> Recording:
+def _one(name, columns, units, origin, bench) -> Recording:
     quasistatic = bench.columns.get("time", {}).get("quasistatic")
     count = len(columns[bench.drive])
     if count < 2:
@@ -263,31 +267,23 @@ def _one(name, columns, origin, bench) -> Recording:
         count = len(columns[bench.drive])
         time = np.arange(count) / count
         metadata["frequency_Hz"] = 1.0
+        origin = {**origin, "quasistatic": True}
     else:
         time = columns["time"] - columns["time"][0]
     channels = {q: v for q, v in columns.items() if q != "time"}
     if not quasistatic:
+        widest = int(round(np.diff(time).max() / max(float(np.median(np.diff(time))), 1e-300))) - 1
         time, channels, bridged = bridge_gaps(time, channels, bench.drive)
         if bridged:
-            metadata["bridged_samples"] = bridged
-    for quantity, (largest, wrong) in SENSIBLE.items():
-        if quantity in channels and np.nanmax(np.abs(channels[quantity])) > largest:
-            raise RecordingError(
-                f"{name}: {quantity} reaches {np.nanmax(np.abs(channels[quantity])):.4g} {_si(quantity)}, more than any such bench gives; "
-                f'if the column is in {wrong}, name it {quantity}_{wrong} or write unit = "{wrong}" in [columns.{quantity}]'
-            )
+            metadata |= {"bridged_samples": bridged, "widest_gap_samples": widest}
+    check_sizes(name, channels, units, bench)
+    refuse_constant(name, bench.output, channels[bench.output])
     column = bench.columns.get(bench.output, {})
     if "emf_turns" in column:
         dt = float(np.median(np.diff(time)))
         channels[bench.output] = integrate_emf(channels[bench.output], channels[bench.drive], dt, column)
     metadata = {k: _number(v) for k, v in metadata.items()}
-    recording = Recording(time, channels, {}, {**origin, "metadata": metadata}, name)
-    _check_size(recording, bench)
-    return recording
-
-
-def _si(quantity):
-    return next(iter(UNITS[quantity]))
+    return Recording(time, channels, {}, {**origin, "metadata": metadata}, name)
 
 
 def _number(value):
@@ -295,26 +291,6 @@ def _number(value):
         return float(value)
     except (TypeError, ValueError):
         return value
-
-
-def _check_size(recording, bench):
-    """Wrong units that are sensible in themselves: far beyond, or far below, what the bench file says."""
-    limit = bench.limits.get("current_A")
-    if limit and "current" in recording.channels:
-        peak = float(np.max(np.abs(recording.channels["current"])))
-        if peak > 20 * limit:
-            raise RecordingError(
-                f"{recording.name}: the current reaches {peak:.4g} A where the bench allows {limit:g} A; "
-                "if the column is in mA, name it current_mA"
-            )
-    reach = bench.constants.get("magnetostriction.lambda_s", 0) * bench.constants.get("magnetostriction.l_rod", 0)
-    if reach and "displacement" in recording.channels:
-        stroke = float(np.ptp(recording.channels["displacement"]))
-        if stroke > 30 * reach or stroke < 1e-5 * reach:
-            raise RecordingError(
-                f"{recording.name}: a stroke of {stroke:.4g} m where the rod gives {reach:.3g} m at saturation; "
-                "if the column is in um, name it displacement_um"
-            )
 
 
 def _uniform_loop(columns, bench):

@@ -7,7 +7,10 @@ import dataclasses
 
 import numpy as np
 
+from .clipping import refuse_clipping
 from .errors import RecordingError
+
+BYSTANDERS = ("temperature", "command")  # recorded beside: they may stand still
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,9 +41,14 @@ class Recording:
                     "cut the run there or fill the gap before fitting"
                 )
         self._check_time()
-        for channel, values in self.channels.items():
-            if channel != "time":
-                _check_clipping(self.name, channel, np.asarray(values))
+        drive = np.asarray(self.channels[self.drive], float) if self.drive in self.channels else None
+        if drive is not None:
+            refuse_constant(self.name, self.drive, drive)
+        # a loop given as points has no time, in which alone a crest has a shape
+        tested = () if self.origin.get("quasistatic") else self.channels.items()
+        for channel, values in tested:
+            if channel not in ("time", *BYSTANDERS):
+                refuse_clipping(self.name, channel, np.asarray(values, float), None if channel == self.drive else drive)
 
     def _check_time(self):
         if not np.all(np.isfinite(self.time)):
@@ -72,9 +80,21 @@ class Recording:
 
     def frequency(self) -> float | None:
         """Fundamental of the drive, Hz; None where less than 0.9 of a period is recorded or nothing repeats."""
-        return fundamental(
-            np.asarray(self.channels[self.drive], float), self.dt, self.origin.get("metadata", {}).get("frequency_Hz")
-        )
+        return fundamental(np.asarray(self.channels[self.drive], float), self.dt, self._header_frequency())
+
+    def _header_frequency(self) -> float | None:
+        stated = self.origin.get("metadata", {}).get("frequency_Hz")
+        try:
+            return float(stated) if float(stated) > 0 else None
+        except (TypeError, ValueError):
+            return None
+
+    def contradicted_frequency(self) -> float | None:
+        """The frequency that the header states, Hz, where the drive repeats at another; None where they agree."""
+        stated, found = self._header_frequency(), self.frequency()
+        if stated is None or found is None or abs(stated - found) < max(0.5 / self.duration, 0.03 * found):
+            return None
+        return stated
 
     def periods(self) -> float:
         """How many periods were recorded (0 where aperiodic)."""
@@ -124,49 +144,49 @@ class Recording:
             return None
         return float(np.sqrt(np.mean(np.var(blocks, axis=0, ddof=1))))
 
+    def noise_is_a_guess(self, channel: str) -> bool:
+        """Whether nothing tells the noise of a channel: less than two whole periods, and no rms in `noise`."""
+        return not self.noise.get(channel) and self.periods() < 2 - 1e-6
 
-def _check_clipping(name, channel, values):
-    span = np.ptp(values)
-    if span == 0:
+
+def refuse_constant(name: str, channel: str, values: np.ndarray):
+    """Raise `RecordingError` where a channel, (time,), never changes."""
+    if np.ptp(values) == 0:
         raise RecordingError(f"{name}: {channel} never changes ({values[0]:.6g}); check the wiring or the column")
-    for extreme, word in ((values.max(), "highest"), (values.min(), "lowest")):
-        at = np.abs(values - extreme) <= 1e-9 * span
-        edges = np.diff(np.concatenate([[0], at.astype(int), [0]]))
-        starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-        longest = int((ends - starts).max())
-        lsb = np.diff(np.unique(values))
-        coarse = len(lsb) and span / np.median(lsb) < 300
-        if longest < max(8, 0.015 * len(values) / max(len(starts), 1)) or coarse:
-            continue
-        # a crest sampled with little noise is round: the samples beside a clipped plateau arrive with a slope
-        first = starts[np.argmax(ends - starts)]
-        before = abs(values[max(first - 1, 0)] - values[max(first - 3, 0)])
-        # a round crest widens with the root of the depth below it, a plateau hardly at all
-        near = np.flatnonzero(np.abs(values - extreme) > 0.01 * span)
-        below, above = near[near < first], near[near > first]
-        wide = (above[0] if len(above) else len(values)) - (below[-1] + 1 if len(below) else 0)
-        if (before > 1.5e-3 * span or longest > 0.75 * wide) and first > 3:
-            raise RecordingError(
-                f"{name}: {channel} is clipped at its {word} value {extreme:.6g} for {longest} samples from sample {first}; "
-                "lower the gain or the drive and record again"
-            )
 
 
 def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
-    """The repetition frequency of a signal to sub-sample precision, Hz.
+    """The repetition frequency of a signal to sub-sample precision, Hz; None where it does not repeat.
 
-    From the hint or the autocorrelation, then refined by least squares of the strongest harmonics over the whole record
-    (periods need not divide the record).
+    From the autocorrelation, then refined by least squares of the strongest harmonics over the whole record (periods need
+    not divide the record). `hint`, Hz: where the search begins, too; it is left where the signal repeats otherwise.
     """
     n = len(x)
     x = x - x.mean()
     if np.ptp(x) == 0:
         return None
-    if hint:
-        f = float(hint)
-        if n * dt * f < 0.9:
-            return None
-        return _refine(x, dt, f, 0.25 / (n * dt)) if n * dt * f > 1.2 else f
+    found = _repetition(x, dt)
+    if not hint:
+        return found
+    stated = float(hint)
+    if n * dt * stated < 0.9:  # less than one period, unless it is seen to repeat
+        return found if found is not None and n * dt * found > 1.2 else None
+    if n * dt * stated <= 1.2 and (found is None or abs(found / stated - 1) < 0.03):
+        return stated
+    refined = _refine(x, dt, stated, 0.25 / (n * dt)) if n * dt * stated > 1.2 else stated
+    power = float(x @ x)
+    left = _leftover(x, dt, refined)(refined) + 1e-12 * power
+    if found is None:
+        return refined if left < 0.5 * power else None
+    left_else = _leftover(x, dt, found)(found) + 1e-12 * power
+    # a longer period must show in the signal, as a modulation does; a shorter one must leave no more of it
+    agrees = abs(refined - found) * n * dt < 0.5
+    return refined if agrees or left < 0.3 * left_else or (refined > found and left < 1.2 * left_else) else found
+
+
+def _repetition(x, dt):
+    """The frequency at which a signal of zero mean repeats by its autocorrelation, Hz, or None."""
+    n = len(x)
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.abs(np.fft.rfft(x, size)) ** 2
     raw = np.fft.irfft(spectrum, size)[:n]
@@ -187,21 +207,22 @@ def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
             if len(peaks):
                 lag = below[0] + peaks[0]
                 return _refine(x, dt, 1.0 / (lag * dt), 1.0 / (lag**2 * dt))
-    # one period alone: it closes on itself
-    if abs(x[0] - x[-1]) < 4 * np.abs(np.diff(x)).max():
+    # one period alone: it closes on itself, in value and in slope (half a sine does in value)
+    e = max(1, n // 40)
+    seam, bends = x[e] - 2 * x[0] + x[n - e], x[2 * e :] - 2 * x[e:-e] + x[: -2 * e]
+    if abs(x[0] - x[-1]) < 4 * np.abs(np.diff(x)).max() and abs(seam) < 3 * np.abs(bends).max():
         return 1.0 / (n * dt)
     return None
 
 
-def _refine(x, dt, f, reach):
-    """The f within `reach` (Hz) whose strongest harmonics leave least of x: a scan, then parabolas.
+def _leftover(x, dt, f):
+    """A function of a frequency near f (Hz): what the strongest harmonics of f leave of x; `orders` says which.
 
     The strongest lines are used, not the first ones: a modulated sine has its power far above its fundamental.
     """
     n = len(x)
     t = dt * np.arange(n)
-    per = 1 / (f * dt)
-    orders = np.arange(1, max(2, int(min(60, 0.4 * per)) + 1))
+    orders = np.arange(1, max(2, int(min(60, 0.4 / (f * dt))) + 1))
     strength = np.array([abs(np.dot(x, np.exp(-2j * np.pi * h * f * t))) for h in orders])
     orders = orders[np.argsort(-strength, kind="stable")[:5]]
     orders = orders[strength[orders - 1] > 0.02 * strength.max()]
@@ -212,6 +233,14 @@ def _refine(x, dt, f, reach):
         coefficients = np.linalg.solve(design @ design.T + 1e-12 * n * np.eye(len(design)), design @ x)
         return np.sum((x - coefficients @ design) ** 2)
 
+    leftover.orders = orders
+    return leftover
+
+
+def _refine(x, dt, f, reach):
+    """The f within `reach` (Hz) whose strongest harmonics leave least of x: a scan, then parabolas."""
+    n, leftover = len(x), _leftover(x, dt, f)
+    orders = leftover.orders
     step = 0.15 / (n * dt * orders.max())
     around = f + step * np.arange(-int(np.ceil(reach / step)), int(np.ceil(reach / step)) + 1)
     around = around[around > 0.5 * f]

@@ -15,18 +15,16 @@ def run_check(arguments, _command) -> int:
     """magjax check."""
     p = parser(
         "check",
-        "Is a recording fit to use? Units, clipping, counts, drift, transient, lag, visited range.",
+        "Is a recording fit to use? Units, clipping, gaps, counts, drift, transient, lag, visited range.",
         "magjax check rec.csv --bench aa-050h",
     )
     p.add_argument("recordings", nargs="+", help="recordings")
     p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name")
     options = p.parse_args(arguments)
     from magjax.bench import load_bench
-    from magjax.inspection import inspect
-    from magjax.recording import load_recordings
+    from magjax.inspection import inspect_files
 
-    bench = load_bench(options.bench)
-    cards = [inspect(r, bench) for r in load_recordings(options.recordings, bench)]
+    cards = inspect_files(options.recordings, load_bench(options.bench))
     if options.json:
         print(json.dumps([c.as_dict() for c in cards]))
     else:

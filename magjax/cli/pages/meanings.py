@@ -204,5 +204,6 @@ CHECK = {
     "facts": "what was found, in words",
     "facts.*": "subject -> text",
     "problems": "sentences with the mend; empty where the recording is fit to use",
+    "warnings": "sentences with the mend: fit to use, but to be known",
     "usable": "whether there are none",
 }

@@ -1,0 +1,157 @@
+"""Clipping: crests cut off flat by a converter or an amplifier at its limit, told by their shape.
+
+At an honest crest the signal is round: what rests within a tolerance of the extreme, L samples between slopes s1 and s2 on
+either side, hides an arch of height L s1 s2 / (2 (s1 + s2)) by these slopes, which is that tolerance again, whatever the
+curvature. At a clipped crest the arch is far higher, and the slopes begin at once, at a corner; where a reading saturates they
+begin slowly. A level that is held on purpose has a corner, too, but straight or sudden flanks, or holds at other levels.
+"""
+
+import numpy as np
+
+from .errors import RecordingError
+
+FEWEST = 5  # samples that rest: an honest crest leaves two equal ones on its top, three with some luck
+ARCH = 4.0  # hidden height in tolerances; one where the crest is a parabola, two for t^4
+LARGEST = 0.021  # tolerance in spans: above it noise hides what a crest is like
+CORNER = 0.5  # slope beside the plateau over that farther off; 0.75 where a sine is cut, 0.4 for t^4, less where it saturates
+CORNER_IN_NOISE = 0.65  # a plateau of many tolerances' depth has lost the slow part of a round approach
+
+
+def quantum(values: np.ndarray) -> float:
+    """The step of a quantised channel, 0 where it is not quantised."""
+    levels = np.unique(values)
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-9 * np.ptp(levels)] if len(steps) else steps  # not the last digits of equal numbers
+    if len(steps) < 3:
+        return float(steps.min()) if len(steps) else 0.0
+    step = float(np.quantile(steps, 0.1, method="lower"))
+    for _ in range(6):  # as Euclid does, but for strays: levels seldom visited leave gaps of several steps
+        beside = np.abs(steps - step * np.round(steps / step))
+        if np.mean(beside < 0.05 * step) > 0.9:
+            return step
+        step = float(np.quantile(beside[beside >= 0.05 * step], 0.1, method="lower"))
+    return 0.0
+
+
+def fast_noise(values: np.ndarray) -> float:
+    """Rms of what changes from sample to sample, by the lower quartile of fourth differences: corners do not count.
+
+    Nor do five equal samples in a row: noise that was clipped with its signal is gone from the plateau.
+    """
+    rests = np.convolve(np.diff(values) == 0, np.ones(4), "valid") > 3.5
+    moving = np.abs(np.diff(values, 4))[~rests]
+    return float(np.quantile(moving, 0.25) / (0.3186 * np.sqrt(70))) if len(moving) else 0.0
+
+
+def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarray | None = None):
+    """Raise `RecordingError` where a channel, (time,), is clipped; `drive`, (time,): what may hold still meanwhile."""
+    for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
+        found = clipped_crest(sign * np.asarray(values, float), drive)
+        if found is not None:
+            first, length = found
+            level = float(np.median(values[first : first + length]))
+            raise RecordingError(
+                f"{name}: {channel} is clipped at its {word} value {level:.6g} for {length} samples from sample {first}; "
+                "lower the gain or the drive and record again"
+            )
+
+
+def clipped_crest(x: np.ndarray, drive: np.ndarray | None = None) -> tuple[int, int] | None:
+    """(first sample, samples) of the longest clipped top of a signal, (time,); None where its crests are honest."""
+    span = float(np.ptp(x))
+    if len(x) < 4 * FEWEST or not span > 0 or not np.all(np.isfinite(x)):
+        return None
+    step, noise = quantum(x), fast_noise(x)
+    resting = max(0.6 * step, 1e-9 * span)
+    # rounding alone looks like noise of 0.3 to 0.4 steps
+    noisy = max(9 * noise if noise > 0.5 * step else 2.6 * step, resting)
+    for tolerance, corner in ((resting, CORNER), (noisy, CORNER_IN_NOISE)):
+        if tolerance > LARGEST * span:
+            break
+        top = x > x.max() - tolerance
+        if top[0] and top[-1]:  # a record that begins and ends on a crest is taken to close
+            shift = int(np.argmin(top))
+            again = clipped_crest(np.roll(x, -shift), None if drive is None else np.roll(drive, -shift)) if not top.all() else None
+            return None if again is None else ((again[0] + shift) % len(x), again[1])
+        runs = _runs(top)
+        longest = max(length for _, length in runs)
+        if longest < FEWEST:
+            continue
+        runs = [run for run in runs if run[1] >= max(FEWEST, longest / 2)]
+        cut = [run for run in runs if _is_cut(x, *run, max(tolerance, step, 3 * noise), max(0.5 * step, noise), corner)]
+        if 2 * len(cut) >= len(runs) and cut:
+            best = max(cut, key=lambda run: run[1])
+            if not _holds_elsewhere(x, best[1], tolerance, span) and not _rests(drive, *best):
+                return best
+    return None
+
+
+def _runs(where) -> list[tuple[int, int]]:
+    """(first, length) of every stretch of True."""
+    edges = np.diff(np.concatenate([[0], where.astype(int), [0]]))
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    return [(int(a), int(b - a)) for a, b in zip(starts, ends, strict=True)]
+
+
+def _is_cut(x, first, length, tolerance, scatter, corner) -> bool:
+    """Whether both flanks meet the plateau at a corner, are not straight, and hide an arch of many tolerances."""
+    rest = x[first + 1 : first + length - 1]
+    level = float(np.median(rest))
+    thirds = [part.mean() for part in np.array_split(rest, 3)]
+    if np.ptp(thirds) > 4 * scatter / np.sqrt(len(rest) / 3) + 0.02 * tolerance:
+        return False  # rounded
+    slopes = []
+    for depth in _flanks(level - x, first, length):
+        reach = _reach(depth, float(np.ptp(x)), scatter)
+        middle = int(np.argmax(depth > 0.5 * depth[reach])) if reach else 0
+        near = max(2, min(length // 8, middle // 4))
+        if middle < 3 * near:
+            return False  # too few samples to tell a jump from a flank
+        slope, beyond = (depth[near] - depth[0]) / near, (depth[3 * near] - depth[near]) / (2 * near)
+        if not slope > max(corner * beyond, 0.0) or _straight(depth[1:reach], scatter):
+            return False
+        slopes.append(slope)
+    return length * slopes[0] * slopes[1] / (2 * sum(slopes)) > ARCH * tolerance
+
+
+def _flanks(depth, first, length):
+    """Depth below a plateau before it (backwards) and after it, the samples next to it first; a record that closes goes on."""
+    before, after = depth[:first][::-1], depth[first + length :]
+    if abs(depth[0] - depth[-1]) <= 2 * np.abs(np.diff(depth)).max():
+        before, after = np.concatenate([before, after[::-1]]), np.concatenate([after, before[::-1]])
+    return before, after
+
+
+def _reach(depth, span, scatter) -> int:
+    """Samples of a flank: down to its turning point or most of the span."""
+    if not len(depth):
+        return 0
+    turned = np.flatnonzero((np.maximum.accumulate(depth) - depth > 10 * scatter + 1e-9 * span) | (depth > 0.95 * span))
+    return max(int(turned[0]) if len(turned) else len(depth), 1) - 1
+
+
+def _straight(flank, scatter) -> bool:
+    """Whether a flank is a ramp: a cubic fits it no better than a line does."""
+    place = np.linspace(-1, 1, len(flank))
+    line, cubic = (float(np.sum((flank - np.polyval(np.polyfit(place, flank, d), place)) ** 2)) for d in (1, 3))
+    return line - cubic < 5 * scatter**2 + len(flank) * (1e-3 * np.ptp(flank)) ** 2
+
+
+def _holds_elsewhere(x, length, tolerance, span) -> bool:
+    """Whether the signal rests half as long at a level between its extremes, as a staircase does."""
+    still = np.abs(np.diff(x)) <= tolerance
+    for first, count in _runs(still):
+        inside = x[first : first + count + 1]
+        if count + 1 >= max(FEWEST, length / 2) and np.ptp(inside) <= 2 * tolerance:
+            if 0.05 * span < float(np.median(inside)) - x.min() < 0.95 * span:
+                return True
+    return False
+
+
+def _rests(drive, first, length) -> bool:
+    """Whether the drive, (time,), stands still during (most of) the plateau: what follows it rests by right."""
+    if drive is None:
+        return False
+    margin = length // 10
+    during = drive[first + margin : first + length - margin]
+    return float(np.ptp(during)) <= max(1.01 * quantum(drive), 6 * fast_noise(drive), 1e-6 * float(np.ptp(drive)))

@@ -1,0 +1,160 @@
+"""Clipped crests are told from honest ones: round, saturating, held, noisy, coarsely counted."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from magjax.bench import load_bench
+from magjax.clipping import clipped_crest, quantum
+from magjax.errors import RecordingError
+from magjax.readers import _read_csv, load_recordings
+from magjax.recording import Recording
+
+BITS = (8, 12, 16, None)
+
+
+def counted(x, bits):
+    """As a converter reads it whose range is +-1."""
+    return x if bits is None else np.round(x * 2 ** (bits - 1)) / 2 ** (bits - 1)
+
+
+def phases(samples, periods=3.37):
+    return np.arange(int(samples * periods)) / samples
+
+
+def is_clipped(x):
+    return clipped_crest(x) is not None or clipped_crest(-x) is not None
+
+
+@pytest.mark.parametrize("bits", BITS)
+@pytest.mark.parametrize("share", [0.9, 0.7, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("sides", ["top", "both"])
+@pytest.mark.parametrize("noisy", ["before", "after"])
+def test_a_cut_sine_is_clipped(bits, share, noise, sides, noisy):
+    rng = np.random.default_rng(1)
+    for samples in (200, 400, 2000):
+        sine = np.sin(2 * np.pi * phases(samples))
+        low, high = (-np.inf, 2 * share - 1) if sides == "top" else (-share, share)
+        e = noise * rng.standard_normal(len(sine))
+        x = np.clip(sine + e, low, high) if noisy == "before" else np.clip(sine, low, high) + e
+        assert is_clipped(counted(x, bits)), samples
+
+
+@pytest.mark.parametrize("start", [0.0, 0.25, 0.6])
+def test_one_period_suffices_wherever_it_begins(start):
+    x = np.minimum(np.sin(2 * np.pi * (phases(400, 1) + start)), 0.8)
+    first, length = clipped_crest(x)
+    at = (first + np.arange(length)) % len(x)
+    assert np.all(x[at] == 0.8) and length == np.sum(x == 0.8)
+
+
+def honest(t):
+    """Periodic signals that nothing cut, by name."""
+    s = np.sin(2 * np.pi * t)
+    triangle = 2 / np.pi * np.arcsin(s)
+    signals = {"sine": s, "triangle": triangle, "crest of fourth order": 1 - 2 * np.sin(np.pi * t) ** 4}
+    signals |= {"third harmonic": (s + np.sin(6 * np.pi * t) / 9) / 0.95}
+    signals |= {f"tanh {a}": np.tanh(a * s) / np.tanh(a) for a in (1, 1.5, 2, 3, 5, 10, 30)}
+    signals |= {f"arctan {a}": np.arctan(a * s) / np.arctan(a) for a in (2, 5, 20)}
+    signals |= {f"magnetostriction {a}": 2 * np.tanh(a * s + 0.7) ** 2 - 1 for a in (2, 5)}
+    signals |= {f"trapezoid {a}": np.clip(a * triangle, -1, 1) for a in (1.7, 5)}
+    signals |= {"square": np.where(s >= 0, 1.0, -1.0), "staircase": np.round(3 * s) / 3}
+    signals |= {"held crest": np.sin(np.pi / 2 * np.clip(2 * triangle, -1, 1))}
+    signals |= {"three tones": sum(np.sin(2 * np.pi * (h * t + 0.16 * h)) for h in (2, 5, 7)) / 3}
+    return signals | {"modulated": np.sin(6 * np.pi * t) * (1 + 0.6 * np.cos(2 * np.pi * t)) / 1.6}
+
+
+@pytest.mark.parametrize("bits", BITS)
+@pytest.mark.parametrize("name", honest(phases(8)))
+def test_what_nothing_cut_is_not_clipped(name, bits):
+    rng = np.random.default_rng(2)
+    for samples in (200, 400, 2000):
+        for periods in (1, 3.37):
+            for noise in (0.0, 1e-5, 1e-4, 1e-3, 2e-3, 5e-3):
+                x = honest(phases(samples, periods))[name]
+                assert not is_clipped(counted(x + noise * rng.standard_normal(len(x)), bits)), (samples, periods, noise)
+
+
+def test_a_reading_that_rests_with_its_drive_is_not_clipped():
+    t = phases(400, 4)
+    drive = np.clip(3.4 / np.pi * np.arcsin(np.sin(2 * np.pi * t)), -1, 1)
+    reading = 1e-5 * (drive + 0.3 * drive**2)  # curved flanks, corners, flat where the drive is held
+    Recording(t, {"current": drive, "displacement": reading})
+    with pytest.raises(RecordingError, match="displacement is clipped"):
+        Recording(t, {"current": np.sin(2 * np.pi * t), "displacement": reading})
+
+
+def test_noise_after_the_cut_does_not_hide_it():
+    t = phases(400, 4)
+    y = np.minimum(1e-5 * np.sin(2 * np.pi * t), 8e-6) + 1e-9 * np.random.default_rng(0).standard_normal(len(t))
+    with pytest.raises(RecordingError, match="clipped at its highest value"):
+        Recording(t, {"current": np.sin(2 * np.pi * t), "displacement": y})
+
+
+@pytest.mark.parametrize("step, levels", [(15, [0, 15, 29, 44, 58, 73]), (3, [0, 9, 12, 21, 30]), (1, range(200))])
+def test_the_count_of_a_converter_is_found(step, levels):
+    expected = {15: 1, 3: 3, 1: 1}[step]
+    assert quantum(0.02 * np.array(levels, float)) == pytest.approx(0.02 * expected)
+
+
+def test_what_is_not_counted_has_no_count():
+    assert quantum(np.random.default_rng(0).standard_normal(500)) == 0.0
+
+
+COIL = {"columns": {"flux_density": {"name": "v_V", "emf_turns": 100, "emf_area": 1e-5}}, "output": "flux_density"}
+
+
+def emf_file(folder, emf, **columns):
+    t = np.arange(len(emf)) / 20000
+    table = {**columns, "time_s": t, "current_A": 0.5 * np.sin(2 * np.pi * 50 * t), "v_V": emf}
+    path = folder / "emf.csv"
+    np.savetxt(path, np.stack(list(table.values()), 1), delimiter=",", header=",".join(table), comments="", fmt="%.12g")
+    return path
+
+
+@pytest.mark.parametrize("merge", [False, True])
+def test_a_clipped_emf_is_seen_before_it_is_integrated(tmp_path, merge):
+    bench = dataclasses.replace(load_bench("aa-050h"), **COIL)
+    t = np.arange(1600) / 20000
+    emf = 0.1 * np.cos(2 * np.pi * 50 * t) + 0.03 * np.cos(2 * np.pi * 150 * t + 1)
+    more = {}
+    if merge:
+        more = {"capture": np.repeat([0.0, 1.0], 800)}
+        bench = dataclasses.replace(bench, columns={**bench.columns, "time": {"split": "capture", "merge": True}})
+    (recording,) = load_recordings([emf_file(tmp_path, emf, **more)], bench)
+    assert np.ptp(recording.channels["flux_density"]) > 0.1
+    with pytest.raises(RecordingError, match=r"emf of flux_density is clipped at its highest value 0.08") as error:
+        load_recordings([emf_file(tmp_path, np.minimum(emf, 0.08), **more)], bench)
+    assert "\n" not in str(error.value) and ("capture=0" in str(error.value)) == merge
+
+
+def test_a_cut_crest_is_seen_before_a_gap_in_it_is_filled(tmp_path):
+    t = np.arange(1600) / 20000
+    x = np.sin(2 * np.pi * 50 * t)
+    rows = np.stack([t, 0.5 * x, np.minimum(1e-5 * x, 6e-6)], 1)
+    keep = np.ones(len(t), bool)
+    keep[[100, 101, 102, 500, 501, 502, 900, 901, 902]] = False  # in the plateaus, where harmonics would bulge
+    np.savetxt(tmp_path / "r.csv", rows[keep], delimiter=",", header="time_s,current_A,displacement_m", comments="", fmt="%.12g")
+    with pytest.raises(RecordingError, match="displacement is clipped at its highest value 6e-06"):
+        load_recordings([tmp_path / "r.csv"], "aa-050h")
+
+
+def test_measured_channels_are_not_clipped(measured):
+    for path in sorted((measured / "rod_eddy").glob("captures_*.csv")):
+        table, _ = _read_csv(path)
+        for capture in np.unique(table["capture"]):
+            for column in ("v_shunt_V", "v_pickup_V"):
+                assert not is_clipped(table[column][table["capture"] == capture]), (path.name, capture, column)
+
+
+@pytest.mark.parametrize("number, clipped", [(33, True), (16, False), (2, False)])  # a fault; fringe errors; an amplifier's limit
+def test_benches_of_the_independent_generator(number, clipped):
+    from tests.blind.cases import make_case, recordings_of
+
+    case = make_case("dev", number)
+    assert clipped == (case.instruments.get("fault") == "clipped")
+    for name, _, current, displacement in recordings_of(case):
+        assert is_clipped(displacement) == clipped, name
+        assert not is_clipped(current), name
