@@ -9,7 +9,6 @@ from .errors import RecordingError
 from .plausibility import STRONG_FIELD
 
 MOST_FILLED = 0.05  # of the samples: more is no measurement
-WIDEST_FILLED = 0.25  # of a period, in one gap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +71,7 @@ def inspect(recording, bench) -> Card:
             facts[f"{name} counts"] = f"step {step:.3g}, {np.ptp(v) / step:.0f} steps over the range"
             if np.ptp(v) / step < 40:
                 problems.append(f"{name} spans only {np.ptp(v) / step:.0f} counts; raise the gain of the converter")
-    _judge_gaps(recording, f, facts, problems, warnings)
+    _judge_gaps(recording, facts, problems, warnings)
     if f is None:
         facts["periods"] = "aperiodic: usable as a check recording, not in a fit"
     else:
@@ -107,7 +106,7 @@ def inspect(recording, bench) -> Card:
     return Card(recording.name, facts, tuple(problems), tuple(warnings))
 
 
-def _judge_gaps(recording, f, facts, problems, warnings):
+def _judge_gaps(recording, facts, problems, warnings):
     metadata = recording.origin.get("metadata", {})
     filled, widest = (int(metadata.get(k) or 0) for k in ("bridged_samples", "widest_gap_samples"))
     if not filled:
@@ -117,7 +116,7 @@ def _judge_gaps(recording, f, facts, problems, warnings):
         f"; the widest gap is {widest} samples" if widest else ""
     )
     # captures that are joined stand in for each other: there the widest gap is not told
-    if widest and (share > MOST_FILLED or widest * recording.dt * (f or 0.0) > WIDEST_FILLED):
+    if widest and share > MOST_FILLED:
         problems.append(f"{facts['gaps']}: too much to be called measured; record again")
     else:
         warnings.append(f"{filled} missing samples were filled; look for the recorder's drops if they come often")

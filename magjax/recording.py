@@ -206,13 +206,23 @@ def _repetition(x, dt):
             peaks = np.flatnonzero((tail[1:-1] >= tail[:-2]) & (tail[1:-1] >= tail[2:]) & (tail[1:-1] > best - slack)) + 1
             if len(peaks):
                 lag = below[0] + peaks[0]
-                return _refine(x, dt, 1.0 / (lag * dt), 1.0 / (lag**2 * dt))
-    # one period alone: it closes on itself, in value and in slope (half a sine does in value)
+                found = _refine(x, dt, 1.0 / (lag * dt), 1.0 / (lag**2 * dt))
+                return found if 2 * lag < n or not _closes(x) else _better(x, dt, 1.0 / (n * dt), found)
+    return 1.0 / (n * dt) if _closes(x) else None
+
+
+def _closes(x) -> bool:
+    """Whether a signal may be one period alone: it closes on itself, in value and in slope (half a sine does in value)."""
+    n = len(x)
     e = max(1, n // 40)
     seam, bends = x[e] - 2 * x[0] + x[n - e], x[2 * e :] - 2 * x[e:-e] + x[: -2 * e]
-    if abs(x[0] - x[-1]) < 4 * np.abs(np.diff(x)).max() and abs(seam) < 3 * np.abs(bends).max():
-        return 1.0 / (n * dt)
-    return None
+    return bool(abs(x[0] - x[-1]) < 4 * np.abs(np.diff(x)).max() and abs(seam) < 3 * np.abs(bends).max())
+
+
+def _better(x, dt, longer, shorter):
+    """The longer of two periods (both as frequencies, Hz) where its harmonics leave far less of x; else the shorter."""
+    left, left_else = (_leftover(x, dt, f)(f) + 1e-12 * float(x @ x) for f in (longer, shorter))
+    return longer if left < 0.3 * left_else else shorter
 
 
 def _leftover(x, dt, f):
