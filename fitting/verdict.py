@@ -217,8 +217,7 @@ def _found(evidence):
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
-    what = "nothing of the catalogue" if rough or evidence.missing else "nothing"
-    text = f"{what} is missing: chi2/N = {evidence.excess:.2f} and "
+    text = f"nothing of the catalogue is missing: chi2/N = {evidence.excess:.2f} and "
     if dropped:
         text += f"{dropped}, which serves best, takes less than half of what is above the noise."
     else:

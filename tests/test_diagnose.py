@@ -38,7 +38,11 @@ def study(bench, effect=None, seed=5):
 def test_silent_where_nothing_is_missing(bench):
     runs, checks = study(bench)
     found = diagnose(runs, bench, check=checks, choices=Choices(fine=250), placebo_runs=2)
-    assert found.verdict == "nothing_missing" and "A wrong c0, H_bias or lambda_s in" in str(found)
+    assert (
+        found.verdict == "nothing_missing"
+        and "nothing of the catalogue is missing" in str(found)
+        and "A wrong c0, H_bias or lambda_s in" in str(found)
+    )
     assert found.placebo["runs"] == 2 and found.placebo["false_alarms"] == 0 and 0 < max(found.placebo["highest_z"]) < 5.5
     low = placebo(found.base, 1e-3, 1)  # everything scores above nothing
     assert low["false_alarms"] == 1 and sum(low["named"].values()) == 1

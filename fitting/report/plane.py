@@ -12,9 +12,10 @@ def never_switched(evidence) -> str:
         return ""
     seen = evidence["plane"]["seen"].astype(bool)
     lower = np.tril(np.ones(seen.shape, bool))
-    blind = int((lower & ~seen).sum())
-    told = "their masses rest on smoothness alone" if blind else "every mass rests on recordings"
-    return f"{blind or 'None'} of the {int(lower.sum())} cells {'was' if blind == 1 else 'were'} never switched by any recording: {told}."
+    count, blind = int(lower.sum()), int((lower & ~seen).sum())
+    if not blind:
+        return f"Every one of the {count} cells is switched by some recording."
+    return f"{blind} of {count} cells {'was' if blind == 1 else 'were'} never switched by any recording: their masses rest on smoothness alone."
 
 
 def mass_map(evidence, stem: str = "masses"):

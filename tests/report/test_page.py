@@ -270,8 +270,8 @@ def test_a_fit_says_how_many_cells_were_never_switched(folders):
     said = never_switched(evidence)
     assert said and said in (folders["fit"] / "report.html").read_text(encoding="utf-8")
     lower = np.tril(np.ones((4, 4), bool))
-    assert never_switched({"plane": {"seen": lower}}).startswith("None of the 10 cells were never switched")
-    assert never_switched({"plane": {"seen": lower & ~np.eye(4, dtype=bool)}}).startswith("4 of the 10 cells were never switched")
+    assert never_switched({"plane": {"seen": lower}}).startswith("Every one of the 10 cells is switched")
+    assert never_switched({"plane": {"seen": lower & ~np.eye(4, dtype=bool)}}).startswith("4 of 10 cells were never switched")
     assert never_switched({}) == ""
 
 
