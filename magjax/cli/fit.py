@@ -121,7 +121,7 @@ def run_diagnose(arguments) -> int:
         "--calibration", nargs="+", default=[], help="the sensor moved by a known amount: files with reference_m beside the reading"
     )
     p.add_argument("--placebo", type=int, default=0, metavar="N",
-                   help="fit and screen N simulated recordings that lack nothing: how often the search would cry wolf (some seconds each)")  # fmt: skip
+                   help="fit and screen N simulated recordings that lack nothing: how often the screening alarms falsely (its fits of rivals are not run; some seconds each)")  # fmt: skip
     options = p.parse_args(arguments)
     prepare_jax()
     from magjax.errors import RecordingError
@@ -158,7 +158,7 @@ def run_diagnose(arguments) -> int:
             print(f"  {row.name:26s} z = {row.z:8.1f}   visible from {row.smallest_visible:.3g}")
         if found.placebo:
             print(
-                f"  placebo: {found.placebo['false_alarms']} false alarms in {found.placebo['runs']} runs, highest z = {max(found.placebo['highest_z']):.1f}"
+                f"  false alarms of the screening: {found.placebo['false_alarms']} in {found.placebo['runs']} runs, highest z = {max(found.placebo['highest_z']):.1f}"
             )
         if folder:
             print(f"\nresults in {folder} (report.html, diagnosis.json)")
