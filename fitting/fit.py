@@ -94,6 +94,8 @@ def _rests(bench, choices):
     """Start memories to try, in order."""
     if choices.rest != "auto":
         return (choices.rest,)
+    if isinstance(bench.start, tuple):  # a history of fields
+        return ("negative",)
     return (RESTS[bench.start],) if bench.start in RESTS else RESTS_IN_ORDER
 
 

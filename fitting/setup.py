@@ -149,6 +149,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     memories = len(spectra) if actuator.output == "displacement" else 0
     layout = Layout.build(basis, names, values, scales, log, memories)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
+    corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
     corners = int(4 * np.ceil(corners / 4))
     # a narrow loop under a strong field turns within a few samples
     finer = 2 if bench.drive == "field" else 1
@@ -165,6 +166,8 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         jnp.asarray(rows), jnp.asarray(shares),
     )  # fmt: skip
     template = actuator if held else make_start_actuator(actuator, basis, rest)
+    if isinstance(bench.start, tuple) and not held:
+        template = template.remembering(bench.start)
     problem = Problem(layout, template, predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
 

@@ -112,6 +112,12 @@ def test_the_papers_recipe_beside_a_fit(recordings, result):
     assert "R_eddy" in str(table)
 
 
+def test_a_given_history_is_where_every_recording_starts(recordings, bench):
+    past = dataclasses.replace(bench, start=(20000.0, 5000.0, 15000.0))
+    found = fit(recordings, past, choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
+    assert np.array_equal(found.actuator.hysteresis.history, past.start)
+
+
 def test_one_unknown_a_cell(recordings, bench):
     got = fit(recordings, bench, choices=dataclasses.replace(QUICK, knots=None, level=25), refine=False)
     assert abs(got.estimate("coil.R_eddy").value / 62 - 1) < 0.05

@@ -64,6 +64,7 @@ def run_fit(arguments) -> int:
     folder = output_folder(options.out)
     from fitting.check import check_errors
     from fitting.fit import fit
+    from fitting.reach import beyond_text
     from fitting.setup import Choices, effect_parameters
 
     choices = Choices(max_jacobians=options.max_jacobians)
@@ -106,6 +107,8 @@ def run_fit(arguments) -> int:
             print(f"\n{text}")
         for row in content["check"]:
             print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g})")
+        if note := beyond_text(content["check"]):
+            print(f"  {note}")
         if folder:
             print(f"\nresults in {folder} (report.html, fit.json, model.json)")
     if stopped is not None:
