@@ -11,6 +11,7 @@ import numpy as np
 from .errors import RecordingError
 
 FEWEST = 5  # samples that rest: an honest crest leaves two equal ones on its top, three with some luck
+MOST_JUDGED = 16  # crests, evenly over the record
 ARCH = 4.0  # hidden height in tolerances; one where the crest is a parabola, two for t^4
 LARGEST = 0.021  # tolerance in spans: above it noise hides what a crest is like
 CORNER = 0.5  # slope beside the plateau over that farther off; 0.75 where a sine is cut, 0.4 for t^4, less where it saturates
@@ -78,6 +79,7 @@ def clipped_crest(x: np.ndarray, drive: np.ndarray | None = None) -> tuple[int, 
         if longest < FEWEST:
             continue
         runs = [run for run in runs if run[1] >= max(FEWEST, longest / 2)]
+        runs = runs[:: len(runs) // MOST_JUDGED + 1]
         cut = [run for run in runs if _is_cut(x, *run, max(tolerance, step, 3 * noise), max(0.5 * step, noise), corner)]
         if 2 * len(cut) >= len(runs) and cut:
             best = max(cut, key=lambda run: run[1])
@@ -139,13 +141,12 @@ def _straight(flank, scatter) -> bool:
 
 def _holds_elsewhere(x, length, tolerance, span) -> bool:
     """Whether the signal rests half as long at a level between its extremes, as a staircase does."""
-    still = np.abs(np.diff(x)) <= tolerance
-    for first, count in _runs(still):
-        inside = x[first : first + count + 1]
-        if count + 1 >= max(FEWEST, length / 2) and np.ptp(inside) <= 2 * tolerance:
-            if 0.05 * span < float(np.median(inside)) - x.min() < 0.95 * span:
-                return True
-    return False
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    width = max(FEWEST, length // 2)
+    low, high = minimum_filter1d(x, width), maximum_filter1d(x, width)
+    between = (low > x.min() + 0.05 * span) & (high < x.max() - 0.05 * span)
+    return bool(np.any(between & (high - low <= 2 * tolerance)))
 
 
 def _rests(drive, first, length) -> bool:

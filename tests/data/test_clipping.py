@@ -61,6 +61,7 @@ def honest(t):
     signals |= {f"magnetostriction {a}": 2 * np.tanh(a * s + 0.7) ** 2 - 1 for a in (2, 5)}
     signals |= {f"trapezoid {a}": np.clip(a * triangle, -1, 1) for a in (1.7, 5)}
     signals |= {"square": np.where(s >= 0, 1.0, -1.0), "staircase": np.round(3 * s) / 3}
+    signals |= {"ramped staircase": np.interp(t % 1.0, np.arange(13) / 12, np.array([0, 0, 1, 1, 3, 3, 1, 1, 0, 0, -3, -3, 0]) / 3)}
     signals |= {"held crest": np.sin(np.pi / 2 * np.clip(2 * triangle, -1, 1))}
     signals |= {"three tones": sum(np.sin(2 * np.pi * (h * t + 0.16 * h)) for h in (2, 5, 7)) / 3}
     return signals | {"modulated": np.sin(6 * np.pi * t) * (1 + 0.6 * np.cos(2 * np.pi * t)) / 1.6}
@@ -72,7 +73,7 @@ def test_what_nothing_cut_is_not_clipped(name, bits):
     rng = np.random.default_rng(2)
     for samples in (200, 400, 2000):
         for periods in (1, 3.37):
-            for noise in (0.0, 1e-5, 1e-4, 1e-3, 2e-3, 5e-3):
+            for noise in (0.0, 1e-5, 1e-4, 1e-3, 2e-3, 5e-3, 1e-2, 3e-2):
                 x = honest(phases(samples, periods))[name]
                 assert not is_clipped(counted(x + noise * rng.standard_normal(len(x)), bits)), (samples, periods, noise)
 
