@@ -23,6 +23,7 @@ from magjax.cli.runtime import prepare_jax
 from magjax.recording import load_recordings
 
 prepare_jax()
+plt.rcParams["font.size"] = 11
 QUICK = "MAGJAX_QUICK" in os.environ  # fewer drives, and the ranking left out
 magjax = [sys.executable, "-m", "magjax"]
 folder = Path("campaign")
@@ -63,18 +64,20 @@ bench.stdout.close()
 
 # %%
 recordings = load_recordings(sorted((folder / "study").glob("*.mjlog")), "aa-050h")
-fig, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-for r in recordings:
+recordings.sort(key=lambda r: r.frequency())
+fig, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+for r, colour in zip(recordings, plt.cm.viridis(np.linspace(0, 0.9, len(recordings))), strict=True):
     y = r.repeats("displacement")
-    axes[0].plot(r.repeats("current")[0], y.mean(axis=0) * 1e6, label=f"{r.frequency():.0f} Hz")
-    axes[1].plot(np.arange(y.shape[1]) / y.shape[1], (y[0] - y.mean(axis=0)) * 1e9, lw=0.5)
-axes[0].set(xlabel="current, A", ylabel="displacement, um", title="mean loops")
-axes[0].legend(fontsize=8)
-axes[1].set(xlabel="phase, periods", ylabel="nm", title="first period less the mean: noise of 40 nm, no trend")
+    axes[0].plot(r.repeats("current")[0], y.mean(axis=0) * 1e6, color=colour, lw=2, label=f"{r.frequency():.0f} Hz")
+    axes[1].plot(np.arange(y.shape[1]) / y.shape[1], (y[0] - y.mean(axis=0)) * 1e9, ".", color=colour, ms=2)
+axes[0].set(xlabel="current / A", ylabel="displacement / µm", title="mean loops")
+axes[1].set(xlabel="part of the period", ylabel="difference / nm", title="first period less the mean: noise, no trend")
+fig.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
+plt.show()
 
 # %% [markdown]
 # ## Fit
-# The plain model meets the loops to a few nanometres. To the eye that is perfect. chi2/N says that it is not.
+# The plain model meets the loops to ten nanometres beside the noise. To the eye that is perfect. chi2/N says that it is not.
 
 # %%
 choices = Choices(rest="negative")  # the emulated bench starts saturated; "auto" would try other pasts, too
@@ -88,10 +91,13 @@ print(base)
 
 # %%
 ranking = [] if QUICK else screen(base.problem, base.refined)
-fig, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")
-ax.barh([c.name for c in ranking[11::-1]], [abs(c.z) for c in ranking[11::-1]], color="0.6")
-ax.axvline(5.5, color="C3", ls="--")
-ax.set(xlabel="score |z|, standard deviations (dashed: what counts)")
+leaders = ranking[11::-1]
+fig, ax = plt.subplots(figsize=(9, 4.2), layout="constrained")
+ax.barh([c.name.replace("_", " ") for c in leaders], [abs(c.z) for c in leaders], color=["0.75"] * len(leaders[1:]) + ["C0"])
+ax.axvline(5.5, color="C3", ls="--", label="what counts: 5.5")
+ax.set(xlabel="score |z| / standard deviations")
+ax.legend(loc="lower right")
+plt.show()
 
 # %% [markdown]
 # ## The repair
@@ -111,11 +117,12 @@ print(repaired)
 
 # %%
 true = {"coil.R_eddy": 62.0, "mechanics.f0": 405.0, "mechanics.xi": 0.81}
-fig, ax = plt.subplots(figsize=(7, 2.6), layout="constrained")
-for k, (result, word) in enumerate(((base, "plain"), (repaired, f"with {leader}"))):
+fig, ax = plt.subplots(figsize=(9, 3.6), layout="constrained")
+for k, (result, word) in enumerate(((base, "plain"), (repaired, f"with {leader.replace('_', ' ')}"))):
     off = [(result.estimate(n).value - v) / result.estimate(n).stderr for n, v in true.items()]
-    ax.plot(off, np.arange(3) + 0.15 * k, "so"[k], label=f"{word}: chi2/N = {result.chi2_per_sample:.2f}")
-ax.axvspan(-2, 2, color="0.9")
-ax.set(yticks=np.arange(3), yticklabels=list(true), xlabel="distance from the truth, standard errors (band: two)")
-ax.legend(fontsize=8)
+    ax.plot(off, np.arange(3) + 0.15 * k, "so"[k], ms=9, label=f"{word}: chi2/N = {result.chi2_per_sample:.2f}")
+ax.axvspan(-2, 2, color="0.9", label="two standard errors")
+ax.set(yticks=np.arange(3), yticklabels=list(true), ylim=(-0.5, 2.6), xlabel="distance from the truth / standard errors")
+fig.legend(loc="outside lower center", ncols=3)
+plt.show()
 print(f"{names[0]} = {repaired.estimate(names[0]).value:.3f} +- {repaired.estimate(names[0]).stderr:.3f}")
