@@ -18,7 +18,8 @@ plt.rcParams["font.size"] = 11
 
 # %% [markdown]
 # ## The same field, many magnetizations
-# A decaying field draws nested loops. On the dotted line the field is the same each time and the magnetization is not: that is memory.
+# A decaying field draws nested loops. On the dotted line the field is the same each time and the magnetization is not: that is
+# memory.
 
 # %%
 masses = gaussian_lorentzian_masses(60, -1000.0, 1000.0, 1.0, 0.0, 300.0, 150.0, 200.0)
@@ -36,8 +37,8 @@ plt.show()
 
 # %% [markdown]
 # ## Where the memory is
-# The same run in the plane of thresholds: which relays are up (dark) after three stages of it. The border between up and down is all
-# that the past leaves: a staircase with a corner for each reversal that no larger one has wiped out.
+# The same run in the plane of thresholds: which relays are up (dark) after three stages of it. The border between up and down is
+# all that the past leaves: a staircase with a corner for each reversal that no larger one has wiped out.
 
 # %%
 states = np.asarray(relay_states(operator, field, "hard"))
@@ -51,8 +52,9 @@ plt.show()
 
 # %% [markdown]
 # ## Relays, smeared
-# A grid of point relays jumps and has no gradient. Spreading each mass over its cell gives a continuous operator with exact gradients.
-# A relay of finite slope ("kp") lies between: on a rising field it all but hides the smeared one, and the lower strip tells them apart.
+# A grid of point relays jumps and has no gradient. Spreading each mass over its cell gives a continuous operator with exact
+# gradients. A relay of finite slope ("kp") lies between: on a rising field it all but hides the smeared one, and the lower strip
+# tells them apart.
 
 # %%
 coarse = Preisach(gaussian_lorentzian_masses(8, -1000.0, 1000.0, 1.0, 0.0, 300.0, 150.0, 200.0), -1000.0, 1000.0)

@@ -49,8 +49,8 @@ for name, truth in (("coil.R_eddy", 62.0), ("mechanics.xi", 0.81), ("mechanics.f
 
 # %% [markdown]
 # ## The density that was found
-# The mass of the relays over their two thresholds, beside the one that was put in (of another form, on a grid twice as fine). In the
-# found one the first column and the last row hold relays that switch once and stay. Colours go with the root.
+# The mass of the relays over their two thresholds, beside the one that was put in (of another form, on a grid twice as fine). In
+# the found one the first column and the last row hold relays that switch once and stay. Colours go with the root.
 
 # %%
 fig, axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained", sharey=True)

@@ -37,8 +37,8 @@ print(fill(str(found), 110))
 
 # %% [markdown]
 # ## Good to the eye, and yet
-# The check recording, foretold by the plain model and by the repaired one. The loops differ by a hair; the strips below them, ten times
-# enlarged, tell all: before, a misfit of up to 0.7 um on the rising branch; after, noise.
+# The check recording, foretold by the plain model and by the repaired one. The loops differ by a hair; the strips below them, ten
+# times enlarged, tell all: before, a misfit of up to 0.7 um on the rising branch; after, noise.
 
 # %%
 fig, axes = plt.subplots(2, 2, figsize=(10, 6.5), layout="constrained", height_ratios=(3, 1.3), sharey="row")
@@ -57,8 +57,8 @@ plt.show()
 
 # %% [markdown]
 # ## Who else could it have been
-# z is the score in standard deviations: what an effect could take of the misfit that the plain model cannot imitate. Many effects score,
-# for one misfit looks a little like another. Dark are those that were fitted for real; only the fit decides.
+# z is the score in standard deviations: what an effect could take of the misfit that the plain model cannot imitate. Many effects
+# score, for one misfit looks a little like another. Blue are those that were fitted for real; only the fit decides.
 
 # %%
 leaders = found.candidates[15::-1]
@@ -77,8 +77,8 @@ for c in found.candidates[:16]:
 
 # %% [markdown]
 # ## What the plain model had got wrong to hide it
-# The eddy resistance had stood in for the missing loss. Its error bar knew nothing of that: an error bar holds only where nothing is
-# missing.
+# The eddy resistance had stood in for the missing loss. Its error bar knew nothing of that: an error bar holds only where nothing
+# is missing.
 
 # %%
 for effect in found.effects:

@@ -54,8 +54,8 @@ plt.show()
 
 # %% [markdown]
 # ## What the dynamic inverse adds
-# Both inverses run open loop; their currents differ by less than 30 mA. What eddy currents and inertia will take away, the dynamic inverse adds
-# beforehand.
+# Both inverses run open loop; their currents differ by less than 30 mA. What eddy currents and inertia will take away, the dynamic
+# inverse adds beforehand.
 
 # %%
 static, dynamic = runs[1], runs[2]

@@ -26,8 +26,8 @@ print(f"order {controller.order} on its model:", controller.margins())
 
 # %% [markdown]
 # ## What the programme found
-# The taps of Q, and what they leave of a pulse in the reference and in the inversion error. The peak of the error is the sum of these
-# bars' sizes, each times its bound.
+# The taps of Q, and what they leave of a pulse in the reference and in the inversion error. The peak of the error is the sum of
+# these bars' sizes, each times its bound.
 
 # %%
 N, problem = 40, made.problem
@@ -50,9 +50,9 @@ plt.show()
 
 # %% [markdown]
 # ## The worst that can happen
-# The inputs that add up all the bars stand at their limits and change sides as the signs of the pulses say. Left, what is worst for the
-# error: at the last sample it is gamma*. Right, what is worst for the control: at the last sample it is u_bar, just not saturated.
-# No admissible reference and inversion error do worse (dashed: the limits).
+# The inputs that add up all the bars stand at their limits and change sides as the signs of the pulses say. Left, what is worst for
+# the error: at the last sample it is gamma*. Right, what is worst for the control: at the last sample it is u_bar, just not
+# saturated. No admissible reference and inversion error do worse (dashed: the limits).
 
 # %%
 signs = lambda pulse: np.where(np.round(pulse[::-1], 6) < 0, -1.0, 1.0)

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 6. A campaign on the bench
-# From a list of drives to a repaired model, on a bench that is a device behind a serial port. Here the device is emulated:
-# `magjax emulate` plays an actuator with other constants than its file says, noise, 16-bit counts, and one piece of physics that the
-# model lacks. With a real one only the port changes.
+# From a list of drives to a repaired model, on a bench that is a device behind a serial port. Here the device is emulated: `magjax
+# emulate` plays an actuator with other constants than its file says, noise, 16-bit counts, and one piece of physics that the model
+# lacks. With a real one only the port changes.
 
 # %%
 import json
@@ -112,8 +112,8 @@ print(repaired)
 
 # %% [markdown]
 # ## What the plain model had got wrong to hide it
-# The bench was made with 62 ohm, 405 Hz, 0.81 and b = 0.15. The plain fit states small errors about wrong values: an error bar holds only
-# where nothing is missing.
+# The bench was made with 62 ohm, 405 Hz, 0.81 and b = 0.15. The plain fit states small errors about wrong values: an error bar
+# holds only where nothing is missing.
 
 # %%
 true = {"coil.R_eddy": 62.0, "mechanics.f0": 405.0, "mechanics.xi": 0.81}

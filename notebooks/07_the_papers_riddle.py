@@ -34,9 +34,9 @@ choices = Choices(rest="negative", fine=250)  # this bench starts saturated; "au
 
 # %% [markdown]
 # ## The bench
-# R_eddy = 290 ohm, f0 = 2 kHz, xi = 0.1; a Butterworth filter of 400 Hz in the sensor and an amplifier of 90 us. Simulated at
-# 2000 samples a period, where the fit takes 250, and with another density; 41 nm of noise. (`python -m tests.studies.riddle` tells a like
-# story on a bench that shares no code with magjax.)
+# R_eddy = 290 ohm, f0 = 2 kHz, xi = 0.1; a Butterworth filter of 400 Hz in the sensor and an amplifier of 90 us. Simulated at 2000
+# samples a period, where the fit takes 250, and with another density; 41 nm of noise. (`python -m tests.studies.riddle` tells a
+# like story on a bench that shares no code with magjax.)
 
 # %%
 truth = {"coil.R_eddy": 290.0, "mechanics.f0": 2000.0, "mechanics.xi": 0.1}
@@ -85,10 +85,10 @@ plt.show()
 
 # %% [markdown]
 # ## The diagnosis of command and displacement
-# Linear filters commute: a filter of second order in the sensor behind a resonance of the rod reads the same as the two exchanged, and a
-# lag before the coil acts much like a loss in it. So these channels cannot say which constants are the rod's. Here the diagnosis is taken
-# in: with two effects that this bench does not have it meets the noise and foretells both check recordings to it. A repair that foretells
-# is a good model; it need not be the physics.
+# Linear filters commute: a filter of second order in the sensor behind a resonance of the rod reads the same as the two exchanged,
+# and a lag before the coil acts much like a loss in it. So these channels cannot say which constants are the rod's. Here the
+# diagnosis is taken in: with two effects that this bench does not have it meets the noise and foretells both check recordings to
+# it. A repair that foretells is a good model; it need not be the physics.
 
 # %%
 if not QUICK:
@@ -110,8 +110,8 @@ plt.show()
 
 # %% [markdown]
 # ## The recordings that settle it
-# The same drives with a shunt in the coil's circuit, and the sensor on a shaker beside a reference. Each instrument is judged by itself;
-# no model of the rod takes part.
+# The same drives with a shunt in the coil's circuit, and the sensor on a shaker beside a reference. Each instrument is judged by
+# itself; no model of the rod takes part.
 
 # %%
 shunted, shunted_check = [record(*drive) for drive in SINES], [record(65, 0.6, 0.0), record(400, 0.5, 0.0)]
