@@ -215,6 +215,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
         + loose(rows)
         + valleys(related)
         + unsettled(problem.spectra)
+        + guessed(recordings, bench)
     )
     return FitResult(
         fitted, bench, bool(solution.converged), message, tuple(rows), related, per_recording, float(chi2n), count,
@@ -258,6 +259,14 @@ def loose(rows) -> str:
     """The parameters that these recordings do not hold, in words, and why."""
     found = [f"{e.name} ({e.why})" for e in rows if e.free and not e.identified]
     return f"; not identified: {', '.join(found)}" if found else ""
+
+
+def guessed(recordings, bench) -> str:
+    """That the noise of recordings without a repeat is a guess, in words."""
+    number = sum(r.noise_is_a_guess(bench.output) for r in recordings)
+    if not number:
+        return ""
+    return f"; the noise of {number} of {len(recordings)} recordings is a guess from their highest orders: record three or more periods"
 
 
 def unsettled(spectra) -> str:

@@ -12,7 +12,7 @@ import pytest
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import cell_basis, hat_basis
-from fitting.fit import fit, loose
+from fitting.fit import fit, guessed, loose
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
@@ -116,6 +116,13 @@ def test_a_given_history_is_where_every_recording_starts(recordings, bench):
     past = dataclasses.replace(bench, start=(20000.0, 5000.0, 15000.0))
     found = fit(recordings, past, choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
     assert np.array_equal(found.actuator.hysteresis.history, past.start)
+
+
+def test_noise_without_a_repeat_is_told_to_be_a_guess(recordings, bench):
+    whole = recordings[0]
+    n = len(whole.time) // round(whole.periods())
+    one = dataclasses.replace(whole, time=whole.time[:n], channels={k: v[:n] for k, v in whole.channels.items()}, noise={})
+    assert "1 of 2 recordings is a guess" in guessed([one, whole], bench) and not guessed([whole], bench)
 
 
 def test_one_unknown_a_cell(recordings, bench):

@@ -10,7 +10,10 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 NUMPY_ONLY = (
     *("magjax/control", "magjax/inverse", "magjax/acquire"),
-    *(f"magjax/{name}.py" for name in "pickup recording readers writers inspection instruments waveforms bench extrema".split()),
+    *(
+        f"magjax/{name}.py"
+        for name in "pickup recording readers writers inspection instruments waveforms bench extrema clipping plausibility".split()
+    ),
 )
 SOURCES = sorted([*ROOT.glob("magjax/**/*.py"), *ROOT.glob("fitting/**/*.py")])
 
