@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from magjax.effects import CATALOGUE
+from magjax.effects import CATALOGUE, SensorLag
 
 from .attribute import (
     BIC_DROP,
@@ -29,6 +29,7 @@ from .attribute import (
 from .check import check_errors
 from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, RESTS_IN_ORDER
 from .fit import fit_or_stop as fit
+from .instruments import RINGING, mode_as_filter
 from .screen import screen
 from .setup import effect_parameters
 from .together import SIDE_BY_SIDE, let_go, together
@@ -62,6 +63,7 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
     """Forward: fit the leaders, adopt the best while it earns its place; then screen again."""
     count = base.data_count
     state = Reached(base, [], {})
+    scored = {c.name: c for c in candidates}
     chosen = base.choices  # the density chosen for the base may be finer than the default: rivals get the same
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
@@ -89,6 +91,8 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         _backward(recordings, bench, state, chosen, count, progress)
         _exchange(recordings, bench, state, chosen, progress)
+        if _commuted(recordings, bench, state, scored.get("sensor_lag"), chosen, progress):
+            _exchange(recordings, bench, state, chosen, progress)
     return state
 
 
@@ -197,6 +201,40 @@ def _exchange(recordings, bench, state, chosen, progress):
         found = min(trials, key=lambda t: t.bic_change)
         state.steps[index] = (found, rivals_of(found, trials), trials, previous)
         state.current = found.result
+
+
+def _commuted(recordings, bench, state, candidate, chosen, progress) -> bool:
+    """A second mode of the rod may be the rod itself, and what passed for the rod a filter in its sensor: linear filters commute.
+
+    Tried from where the two have changed places, which no fit from the base's optimum reaches. Whether the filter was adopted.
+    """
+    index = next((k for k, step in enumerate(state.steps) if step[0].name == "second_mode"), None)
+    names, held = ("mechanics.f0", "mechanics.xi"), {e.name for e in state.current.actuator.effects}
+    known = set(names) & set(bench.priors) or not set(names) <= set(bench.free)
+    if index is None or candidate is None or known or not {"second_mode"} <= held or "sensor_lag" in held:
+        return False
+    estimate = state.current.estimate
+    modes = [tuple(estimate(n).value for n in names), tuple(estimate(f"effects.second_mode.{n}").value for n in ("f2", "xi2"))]
+    rod, sensor = sorted(modes, key=lambda mode: mode[1])
+    if sensor[1] < RINGING:
+        return False
+    if progress is not None:
+        progress("a filter in the sensor in place of a second mode", 0, state.current.chi2_per_sample)
+    actuator = state.current.actuator.without_effect("second_mode").replace(dict(zip(names, rod, strict=True)))
+    actuator = actuator.with_effect(SensorLag(*mode_as_filter(*sensor)))
+    more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra, "start": state.current}
+    result = fit(recordings, bench, actuator=actuator, extra=effect_parameters(actuator), **more)
+    best, rivals, good, previous = state.steps[index]
+    fall = chi2_of(previous) - chi2_of(state.current)
+    drop, cost = chi2_of(previous) - chi2_of(result), np.log(result.data_count)
+    own = dataclasses.replace(best, result=state.current, drop=fall, bic_change=best.parameters * cost - fall)
+    number = len(SensorLag.parameters())
+    swapped = Trial(candidate, result, drop, number * cost - drop, True, best.explained_share, number)
+    found = min((own, swapped), key=lambda t: t.bic_change)
+    trials = [own, swapped, *(t for t in rivals if t.name not in ("second_mode", "sensor_lag"))]
+    state.steps[index] = (found, rivals_of(found, trials), trials, previous)
+    state.current = found.result
+    return found is swapped
 
 
 def _finer(recordings, bench, current, best, good, chosen, excess, progress, any_rest: bool = True):

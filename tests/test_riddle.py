@@ -51,3 +51,36 @@ def test_the_papers_riddle():
     from tests.studies.riddle import tell
 
     assert untrue(tell()) == []
+
+
+@pytest.mark.long
+def test_a_second_mode_gives_way_to_the_filter_that_it_stands_for():
+    """Here a second mode with the rod at the filter's place meets the recordings as well: both are named, in a group."""
+    from fitting.demo import SINES, concealed_actuator
+    from fitting.diagnose import diagnose
+    from fitting.instruments import mode_as_filter
+    from fitting.setup import Choices
+    from magjax.bench import load_bench
+    from magjax.effects import AmplifierLag, SensorLag
+    from magjax.recording import Recording
+    from magjax.simulate import simulate
+
+    bench, rng = load_bench("aa-050h"), np.random.default_rng(7)
+    truth = {"coil.R_eddy": 290.0, "mechanics.f0": 2000.0, "mechanics.xi": 0.1}
+    true = (
+        concealed_actuator(bench)
+        .replace(truth)
+        .with_effect(SensorLag(*mode_as_filter(400.0, 0.5**0.5)))
+        .with_effect(AmplifierLag(90e-6))
+    )
+    runs = []
+    for f, A, offset in SINES:
+        drive = offset + A * np.sin(2 * np.pi * np.arange(2000) / 2000)
+        reading = np.tile(np.asarray(simulate(true, drive, 1 / (2000 * f), periodic=True).reading)[::2], 4)
+        channels = {"current": np.tile(drive[::2], 4), "displacement": reading + 41e-9 * rng.standard_normal(4000)}
+        runs.append(Recording(np.arange(4000) / (1000 * f), channels, {}, {}, f"{f} Hz"))
+    found = diagnose(runs, bench, choices=Choices(rest="negative", fine=250))
+    groups = [{r["name"] for r in g} if isinstance(g[0], dict) else set(g) for g in found.groups]
+    assert found.verdict == "group" and {"sensor_lag", "second_mode"} in groups, found.message
+    assert found.next_experiment["channels"] == [SHUNT, CALIBRATION]
+    assert abs(found.repaired.estimate("mechanics.f0").value / 2000 - 1) < 0.05
