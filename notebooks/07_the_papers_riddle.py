@@ -86,9 +86,8 @@ plt.show()
 # %% [markdown]
 # ## The diagnosis of command and displacement
 # Linear filters commute: a filter of second order in the sensor behind a resonance of the rod reads the same as the two exchanged,
-# and a lag before the coil acts much like a loss in it. So these channels cannot say which constants are the rod's. Here the
-# diagnosis is taken in: with two effects that this bench does not have it meets the noise and foretells both check recordings to
-# it. A repair that foretells is a good model; it need not be the physics.
+# and a lag before the coil acts much like a loss in it. So these channels cannot say which constants are the rod's. The diagnosis
+# says just that, and what to record: it has tried the filter and the resonance in each other's places.
 
 # %%
 if not QUICK:
@@ -109,7 +108,7 @@ ax.legend(loc="lower left")
 plt.show()
 
 # %% [markdown]
-# ## The recordings that settle it
+# ## The recordings that were asked for
 # The same drives with a shunt in the coil's circuit, and the sensor on a shaker beside a reference. Each instrument is judged by
 # itself; no model of the rod takes part.
 
