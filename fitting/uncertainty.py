@@ -66,7 +66,10 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
             at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach)
             start = float(layout.starts[layout.names.index(name)])
             k = layout.names.index(name)
-            alone = name in GAUGES and layout.density_unknowns > 0 and float(problem.target.priors[k]) <= NO_PRIOR
+            gauge, prior = name in GAUGES and layout.density_unknowns > 0, float(problem.target.priors[k])
+            alone = gauge and prior <= NO_PRIOR
+            if gauge and not alone:  # the cells' edges hold it, not the data: known as well as its prior says
+                stderr = max(stderr, abs(slope) / prior)
             why = GAUGES[name] if alone else "" if stderr < 0.5 * reach else "its error is as large as itself"
             rows.append(Estimate(name, value, stderr, info.unit, info.meaning, True, start, at_bound, not why, why))
         else:

@@ -269,6 +269,7 @@ def test_a_bias_freed_with_a_prior_comes_back(recordings, bench):
     got = fit(recordings, stated, extra=("coil.H_bias",), choices=QUICK, refine=False)
     bias, resistance = got.estimate("coil.H_bias"), got.estimate("coil.R_eddy")
     assert got.chi2_per_sample < 1.3 and abs(bias.value - 1.23e4) < 4 * bias.stderr < 400
+    assert bias.stderr >= 60  # the data do not know it better
     assert abs(resistance.value / 62 - 1) < 0.02
 
 
