@@ -76,11 +76,12 @@ class Picture:
     title: str
     caption: str
     svg: str
+    png: bytes = b""
 
 
 def picture(figure: Figure, stem: str, title: str, caption: str, description: str = "") -> Picture:
     """A drawn figure with its words; `description`: what the caption does not say, for those who do not see it."""
-    return Picture(stem, title, caption, to_svg(figure, stem, title, f"{caption} {description}".strip()))
+    return Picture(stem, title, caption, to_svg(figure, stem, title, f"{caption} {description}".strip()), to_png(figure))
 
 
 def percent(share: float) -> str:
@@ -93,6 +94,13 @@ def percent(share: float) -> str:
 def unit_text(unit: str) -> str:
     """A unit with raised exponents; nothing for a number."""
     return "" if unit == "1" else unit.replace("^0.5", "^½").replace("^2", "²").replace("^3", "³").replace("^-1", "⁻¹")
+
+
+def to_png(figure: Figure) -> bytes:
+    """The figure as a PNG on white, for slides and programs that draw no SVG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=144, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def to_svg(figure: Figure, stem: str, title: str, description: str) -> str:

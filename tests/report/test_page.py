@@ -120,6 +120,8 @@ def test_names_are_escaped(folders):
 def test_svg_files_are_well_formed_and_nothing_is_half_written(folders, kind):
     for path in (folders[kind] / "figures").glob("*.svg"):
         xml.dom.minidom.parse(str(path))
+        image = path.with_suffix(".png").read_bytes()
+        assert image[:4] == b"\x89PNG" and int.from_bytes(image[16:20], "big") > 500  # pixels across
     assert not list(folders[kind].rglob("*.part"))
 
 
