@@ -133,7 +133,7 @@ def test_what_scores_or_was_fitted_is_not_absorbed():
     assert module._absorbed(candidates, {"accommodation": None}) == ("linear_strain", "mean_field")
 
 
-@pytest.mark.parametrize("inside", ["the first fit", "trials side by side"])
+@pytest.mark.parametrize("inside", ["the first fit", pytest.param("trials side by side", marks=pytest.mark.long)])
 def test_ctrl_c_ends_a_diagnosis(bench, inside):
     runs, _ = study(bench, SensorLag(tau=1e-4, order2=0.5))
     others = tuple(e.name for e in CATALOGUE if e.name not in {"sensor_lag", "mean_field", "duffing_stiffness"})

@@ -116,6 +116,7 @@ def test_a_share_beyond_its_range_still_has_steps():
         assert np.abs(np.asarray(signals.residual)).max() < 1e-5 and np.isfinite(np.asarray(signals.reading)).all()
 
 
+@pytest.mark.long
 def test_the_screening_scores_it_at_its_finite_size():
     from fitting.demo import concealed_actuator, record
     from fitting.fit import fit
