@@ -210,8 +210,9 @@ def _commuted(recordings, bench, state, candidate, chosen, progress) -> bool:
     """
     index = next((k for k, step in enumerate(state.steps) if step[0].name == "second_mode"), None)
     names, held = ("mechanics.f0", "mechanics.xi"), {e.name for e in state.current.actuator.effects}
-    known = set(names) & set(bench.priors) or not set(names) <= set(bench.free)
-    if index is None or candidate is None or known or not {"second_mode"} <= held or "sensor_lag" in held:
+    if index is None or candidate is None or "second_mode" not in held or "sensor_lag" in held:
+        return False
+    if set(names) & set(bench.priors) or not set(names) <= set(bench.free):
         return False
     estimate = state.current.estimate
     modes = [tuple(estimate(n).value for n in names), tuple(estimate(f"effects.second_mode.{n}").value for n in ("f2", "xi2"))]

@@ -59,8 +59,10 @@ def test_a_terminal_sees_a_sign_of_life_and_then_the_whole_result():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals on Windows")
 def test_a_failure_on_a_terminal_is_one_whole_line():
-    _, _, status, text = silence([sys.executable, "-m", "magjax", "check", "no-such-file.csv"])
-    assert status == 3 and "magjax check: no-such-file.csv: no such file" in text and "Traceback" not in text
+    _, _, status, text = silence(
+        [sys.executable, "-m", "magjax", "export", "no-such-file.csv", "--bench", "aa-050h", "--out", "x.csv"]
+    )
+    assert status == 3 and "magjax export: no-such-file.csv: no such file" in text and "Traceback" not in text
 
 
 def test_a_pipe_and_quiet_see_nothing(capsys):
