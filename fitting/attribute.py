@@ -104,7 +104,7 @@ def try_effect(recordings, bench, base, candidate, effect_class, choices, excess
         recordings, bench, actuator=actuator, start=base, extra=effect_parameters(actuator), choices=choices, refine=False, progress=progress,
         target=target, spectra=base.spectra,
     )  # fmt: skip
-    return _credited(candidate, result, base, effect, excess)
+    return credited(candidate, result, base, effect, excess)
 
 
 def settled(recordings, bench, base, trial, excess, progress=None, target: float = np.inf) -> Trial:
@@ -116,10 +116,10 @@ def settled(recordings, bench, base, trial, excess, progress=None, target: float
         recordings, bench, actuator=result.actuator, start=result, extra=effect_parameters(result.actuator), choices=result.choices, refine=False,
         progress=progress, target=target, spectra=base.spectra,
     )  # fmt: skip
-    return _credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
+    return credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
 
 
-def _credited(candidate, result, base, effect, excess) -> Trial:
+def credited(candidate, result, base, effect, excess) -> Trial:
     """What a fit with a further effect is worth beside the base's."""
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)

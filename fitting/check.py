@@ -3,6 +3,7 @@
 import numpy as np
 
 from magjax.extrema import nesting
+from magjax.plausibility import si_unit
 from magjax.simulate import simulate
 
 from .model import Predictor, predicted_lines
@@ -39,7 +40,7 @@ def beyond_plane(actuator, recording, bench) -> float:
 def check_errors(before, after, recordings, bench, cleaned=None) -> list[dict]:
     """rms error on each check recording before and after the repair; `cleaned`: what the repaired model is held against,
     the recordings without the drift, heat or hum that it names."""
-    unit = {"displacement": "m", "flux_density": "T"}.get(bench.output, "A/m")
+    unit = si_unit(bench.output)
     rows = []
     for recording, clean in zip(recordings, recordings if cleaned is None else cleaned, strict=True):
         errors = []

@@ -56,61 +56,50 @@ def diagnose(
     choices = with_held_masses(choices, bench, actuator)
     if known := known_instruments(recordings, calibration, bench):
         return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
-    held = effect_parameters(actuator)
     spectra = spectra_of(recordings, bench, choices.harmonics)
     say("between the harmonics", 0, None)
     if alternation := alternating(recordings, spectra, bench.output):
-        rest = diagnose(
-            alternation.cleaned,
-            bench,
-            check=check,
-            actuator=actuator,
-            choices=choices,
-            progress=progress,
-            placebo_runs=placebo_runs,
-        )
-        return alternation.told(rest)
-    problem = data_problem(recordings, spectra, bench.output)
-    if problem:
+        asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress, "placebo_runs": placebo_runs}
+        return alternation.told(diagnose(alternation.cleaned, bench, **asked))
+    held = effect_parameters(actuator)
+    if problem := data_problem(recordings, spectra, bench.output):
         base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress, refine=False)
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
     adopted, cleaned = _record_level(recordings, spectra, bench, choices)
-    base_now = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
-    if problem := wrong_bench(base_now):
-        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base_now)
-    candidates = screened(base_now, choices)
-    base_now, candidates, zero, rival = _sensor_zero(cleaned, bench, base_now, candidates, actuator, held, choices, progress)
-    base, held = base_now, held if zero is None else (*held, "sensor.offset")
+    plain = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
+    if problem := wrong_bench(plain):
+        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
+    candidates = screened(plain, choices)
+    plain, candidates, zero, rival = _sensor_zero(cleaned, bench, plain, candidates, actuator, held, choices, progress)
+    raw, held = plain, held if zero is None else (*held, "sensor.offset")
     if adopted:  # what the plain model makes of the readings as they came
-        base = fit(recordings, bench, actuator=actuator, extra=held, choices=base_now.choices, progress=progress, refine=False)
-    recordings = cleaned
-    cleaned_check = remove_from_checks(check, [e for e, _ in adopted], bench)
-    base_now, candidates = _screened_finer(recordings, bench, base_now, candidates, choices, held, progress)
-    place = where(base_now, candidates, recordings, bench.output)
-    reached = search(recordings, bench, base_now, candidates, choices, progress, cleaned_check)
+        raw = fit(recordings, bench, actuator=actuator, extra=held, choices=plain.choices, progress=progress, refine=False)
+    checks = check, remove_from_checks(check, [e for e, _ in adopted], bench)
+    plain, candidates = _screened_finer(cleaned, bench, plain, candidates, choices, held, progress)
+    place = where(plain, candidates, cleaned, bench.output)
+    reached = search(cleaned, bench, plain, candidates, choices, progress, checks[1])
     evidence = Evidence(
-        reached,
-        tuple(adopted),
-        base,
-        base_now,
-        tuple(candidates),
-        tuple(recordings),
-        bench,
-        (check, cleaned_check),
-        _floors(base_now),
-        place,
-        _absorbed(candidates, reached.tried),
-    )
-    found = verdict(evidence)
-    if found.verdict == "unknown_at":
-        if _rough(evidence, found.check):
-            found = verdict(evidence, rough=True)
-        else:
-            found = with_learned_term(found, base_now, recordings, bench, cleaned_check, progress)
+        reached, tuple(adopted), raw, plain, tuple(candidates), tuple(cleaned), bench, checks, _floors(plain), place, _absorbed(candidates, reached.tried)
+    )  # fmt: skip
+    found = _concluded(evidence, progress)
     if placebo_runs > 0:
-        found = dataclasses.replace(
-            found, placebo=placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress)
-        )
+        alarms = placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress)
+        found = dataclasses.replace(found, placebo=alarms)
+    return _with_zero(found, zero, rival)
+
+
+def _concluded(evidence, progress) -> Diagnosis:
+    """The verdict; where no effect explains the misfit, a rough density's or with a function learned in its place."""
+    found = verdict(evidence)
+    if found.verdict != "unknown_at":
+        return found
+    if _rough(evidence, found.check):
+        return verdict(evidence, rough=True)
+    return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], progress)
+
+
+def _with_zero(found, zero, rival) -> Diagnosis:
+    """The diagnosis with a word on the sensor's zero: adopted, or told of beside an effect that does as well."""
     if zero is not None:
         note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
     elif rival is not None and (found.effects or found.groups):

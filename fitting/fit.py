@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.bench import load_bench
+from magjax.plausibility import si_unit
 from magjax.simulate import require_x64
 
 from .joint import data_jacobian, data_residual, prior_matrix, solve
@@ -242,7 +243,7 @@ def recording_fits(problem, residual, recordings, bench):
         rows.append(
             RecordingFit(
                 recording.origin.get("file", recording.name) if "[" not in recording.name else recording.name,
-                recording.origin.get("sha256", ""), bench.output, {"displacement": "m", "flux_density": "T"}.get(bench.output, "A/m"),
+                recording.origin.get("sha256", ""), bench.output, si_unit(bench.output),
                 s.frequency, s.periods, s.noise_rms, float(np.sqrt(power.sum() + between)), chi2 / number,
             )
         )  # fmt: skip

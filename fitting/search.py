@@ -20,6 +20,7 @@ from .attribute import (
     WEAK_TIE,
     Trial,
     chi2_of,
+    credited,
     family,
     leaders,
     rivals_of,
@@ -225,12 +226,12 @@ def _commuted(recordings, bench, state, candidate, chosen, progress) -> bool:
     actuator = actuator.with_effect(SensorLag(*mode_as_filter(*sensor)))
     more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra, "start": state.current}
     result = fit(recordings, bench, actuator=actuator, extra=effect_parameters(actuator), **more)
-    best, rivals, good, previous = state.steps[index]
-    fall = chi2_of(previous) - chi2_of(state.current)
-    drop, cost = chi2_of(previous) - chi2_of(result), np.log(result.data_count)
-    own = dataclasses.replace(best, result=state.current, drop=fall, bic_change=best.parameters * cost - fall)
-    number = len(SensorLag.parameters())
-    swapped = Trial(candidate, result, drop, number * cost - drop, True, best.explained_share, number)
+    best, rivals, _, previous = state.steps[index]
+    excess = max(chi2_of(previous) - 0.92 * result.data_count, MIN_DROP)
+    own, swapped = (
+        credited(c, r, previous, r.actuator.effect(c.name), excess)
+        for c, r in ((best.candidate, state.current), (candidate, result))
+    )
     found = min((own, swapped), key=lambda t: t.bic_change)
     trials = [own, swapped, *(t for t in rivals if t.name not in ("second_mode", "sensor_lag"))]
     state.steps[index] = (found, rivals_of(found, trials), trials, previous)

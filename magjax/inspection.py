@@ -77,7 +77,7 @@ def inspect(recording, bench) -> Card:
     else:
         facts["fundamental"] = f"{f:.6g} Hz, {len(x) * recording.dt * f:.3f} periods of {1 / (f * recording.dt):.2f} samples"
         facts["lag of the reading"] = f"{channel_lag(x, y, recording.dt) * 1e3:.4g} ms"
-        _judge_repeats(recording, x, y, f, facts, problems)
+        _judge_repeats(recording, bench.output, facts, problems)
         if (stated := recording.contradicted_frequency()) is not None:
             warnings.append(
                 f"the header says {stated:g} Hz, the drive repeats at {f:.6g} Hz and is believed; mend `# frequency_Hz`"
@@ -137,17 +137,13 @@ def _plane(bench):
     return float(ends[0]), float(ends[1])
 
 
-def _judge_repeats(recording, x, y, f, facts, problems):
-    per = 1 / (f * recording.dt)
-    count = int(np.floor(len(y) / per + 1e-6))
+def _judge_repeats(recording, channel, facts, problems):
+    y, blocks = np.asarray(recording.channels[channel]), recording.repeats(channel)
+    count, per = len(blocks), recording.period_samples()
     if count < 2:
         facts["noise"] = "one period only: it cannot be told from the repeats"
         return
-    phase = np.arange(int(per)) / int(per)
-    t = np.arange(len(y)) / per
-    blocks = np.stack([np.interp(k + phase, t, y) for k in range(count)])
-    spread = blocks - blocks.mean(axis=0)
-    noise = float(np.sqrt(np.mean(spread**2) * count / (count - 1)))
+    noise = recording.repeat_noise(channel)
     span = float(np.ptp(y))
     facts["noise from repeats"] = f"{noise:.3g} rms ({noise / span:.2g} of the range)"
     drift = float(blocks[-1].mean() - blocks[0].mean())
