@@ -14,18 +14,20 @@ from .alternation import alternating
 from .attribute import MIN_DROP, TIE, WEAK_TIE, chi2_of
 from .fit import FINER_FROM, REFINE_BELOW
 from .fit import fit_or_stop as fit
-from .floors import data_problem, record_effects, remove_from_checks, remove_record_effect, solver_floor, wrong_bench
+from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term
 from .locate import where
+from .on_lines import hum_score, offset_score
 from .placebo import placebo
-from .screen import offset_score
+from .record_level import hum_of, record_effects, remove_from_checks, remove_record_effect
 from .search import SECOND_Z, screened, search
 from .setup import Choices, effect_parameters, spectra_of, with_held_masses
 from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
 
 RECORD_Z = 8.0
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
+MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
 ABSORBED_VISIBILITY = 0.004
 LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
@@ -66,18 +68,30 @@ def diagnose(
         base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress, refine=False)
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
     adopted, cleaned = _record_level(recordings, spectra, bench, choices)
-    plain = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
+    return _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress, placebo_runs)
+
+
+def _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress, placebo_runs, plain=None) -> Diagnosis:
+    """The diagnosis of recordings `cleaned` of the record-level effects `adopted`; `plain`: their fit, where it is known."""
+    if plain is None:
+        plain = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
     if problem := wrong_bench(plain):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
     candidates = screened(plain, choices)
+    asked = bench, check, actuator, held, choices, progress, placebo_runs
+    hummed = {"actuator": actuator, "extra": held, "choices": choices, "progress": progress}
+    if found := _hum_on_harmonics(cleaned, adopted, bench, plain, candidates, hummed):
+        return _examined(recordings, found[0], [*adopted, found[1]], *asked, plain=found[2])
     plain, candidates, zero, rival = _sensor_zero(cleaned, bench, plain, candidates, actuator, held, choices, progress)
-    raw, held = plain, held if zero is None else (*held, "sensor.offset")
+    raw, free = plain, held if zero is None else (*held, "sensor.offset")
     if adopted:  # what the plain model makes of the readings as they came
-        raw = fit(recordings, bench, actuator=actuator, extra=held, choices=plain.choices, progress=progress, refine=False)
+        raw = fit(recordings, bench, actuator=actuator, extra=free, choices=plain.choices, progress=progress, refine=False)
     checks = check, remove_from_checks(check, [e for e, _ in adopted], bench)
-    plain, candidates = _screened_finer(cleaned, bench, plain, candidates, choices, held, progress)
+    plain, candidates = _screened_finer(cleaned, bench, plain, candidates, choices, free, progress)
     place = where(plain, candidates, cleaned, bench.output)
     reached = search(cleaned, bench, plain, candidates, choices, progress, checks[1])
+    if reached.steps and (found := _hum_on_harmonics(cleaned, adopted, bench, reached.current, (), hummed)):
+        return _examined(recordings, found[0], [*adopted, found[1]], *asked)
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), tuple(cleaned), bench, checks, _floors(plain), place, _absorbed(candidates, reached.tried)
     )  # fmt: skip
@@ -113,6 +127,26 @@ def _absorbed(candidates, tried) -> tuple[str, ...]:
     """What these recordings could not show: the density makes nearly all of it. What scores or was fitted did show."""
     silent = [c for c in candidates if abs(c.z) < Z_THRESHOLD and c.name not in tried]
     return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY)
+
+
+def _hum_on_harmonics(recordings, adopted, bench, base, candidates, asked):
+    """Hum that falls on harmonics of the drive, where no repeat shows it: adopted if it scores above every effect and takes
+    most of what `base` leaves. Returns the recordings without it, the effect with its rivals, and their fit; None elsewhere.
+    """
+    held = any(e.name == "mains_hum" for e, _ in adopted)
+    if held or bench.output != "displacement" or _quasistatic(bench) or not base.chi2_per_sample > SILENT_CHI2:
+        return None
+    excess = chi2_of(base) - 0.92 * base.data_count
+    z, tones = hum_score(base.problem, base.refined)
+    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 for c in candidates)]):
+        return None
+    effect = hum_of(base.spectra, z, tones)
+    cleaned = remove_record_effect(recordings, effect, bench.output)
+    more = {"actuator": base.actuator, "extra": effect_parameters(base.actuator)}
+    freed = fit(cleaned, bench, **{**asked, **more})
+    if chi2_of(freed) > chi2_of(base) - MOST_OF_IT * excess:
+        return None
+    return cleaned, (effect, []), freed
 
 
 def _sensor_zero(recordings, bench, base, candidates, actuator, held, choices, progress):
@@ -156,10 +190,14 @@ def _screened_finer(recordings, bench, base, candidates, choices, held, progress
     return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, choices))
 
 
+def _quasistatic(bench) -> bool:
+    return bool(bench.columns.get("time", {}).get("quasistatic"))
+
+
 def _record_level(recordings, spectra, bench, choices):
     """Drift, heat and hum, scored between the harmonics: (adopted with their rivals, the recordings without them)."""
     adopted = []
-    for _ in range(0 if bench.columns.get("time", {}).get("quasistatic") or bench.output != "displacement" else 2):
+    for _ in range(0 if _quasistatic(bench) or bench.output != "displacement" else 2):
         found = [e for e in record_effects(recordings, spectra) if e.name not in {a.name for a, _ in adopted}]
         best = found[0]
         if abs(best.z) < RECORD_Z:

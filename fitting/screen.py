@@ -303,13 +303,3 @@ def screen(problem, solution) -> list[Candidate]:
         if effect.name not in best or abs(candidate.z) > abs(best[effect.name].z):
             best[effect.name] = candidate
     return sorted(best.values(), key=lambda c: -abs(c.z))
-
-
-def offset_score(problem, solution) -> float:
-    """z of a constant added to every reading, beside everything the base can do."""
-    projector = Projector(problem, solution)
-    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
-    ones = np.zeros(problem.target.lines.shape, complex)
-    ones[:, 0] = 1.0
-    part = projector.project(np.asarray(whitened(jnp.asarray(ones), zero)))
-    return float(-(part @ projector.residual) / max(np.linalg.norm(part), 1e-300))

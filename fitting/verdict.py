@@ -269,8 +269,8 @@ def _attributed(evidence, common, effects, swap, asked) -> Diagnosis:
 def _fall(evidence) -> str:
     """What the repair does to the misfit, in words."""
     before, after = evidence.raw.chi2_per_sample, evidence.excess
-    if not evidence.reached.steps:
-        return f"it stands between the harmonics, and without it chi2/N is {after:.2f}"
+    if not evidence.reached.steps and before < after + 0.2:
+        return f"{'it stands' if len(evidence.adopted) == 1 else 'they stand'} between the harmonics, and chi2/N is {after:.2f} without"
     return f"chi2/N falls from {before:.3g} to {after:.2f}"
 
 

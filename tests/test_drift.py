@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fitting.floors import data_problem, record_effects, remove_from_checks, remove_record_effect
+from fitting.floors import data_problem
+from fitting.record_level import record_effects, remove_from_checks, remove_record_effect
 from fitting.setup import spectra_of
 from magjax.bench import load_bench
 from magjax.recording import Recording

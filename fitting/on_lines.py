@@ -1,0 +1,65 @@
+"""What is added to the reading and repeats with the drive, so that no repeat shows it: a sensor's zero, hum on a harmonic.
+
+Scored as the effects are: off everything that the base can do (`screen.Projector`).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .model import whitened
+from .record_level import HUM_TONES, MAINS
+from .screen import Projector
+
+
+def offset_score(problem, solution) -> float:
+    """z of a constant added to every reading, beside everything the base can do."""
+    projector = Projector(problem, solution)
+    part = _projected(problem, projector, [(slice(None), 0, 1.0)])[:, 0]
+    return float(-(part @ projector.residual) / max(np.linalg.norm(part), 1e-300))
+
+
+def hum_score(problem, solution):
+    """Hum where it falls on harmonics of the drive, a phase of its own in each recording, beside everything the base can do.
+
+    Returns, of the mains frequency that explains more: the score z, of the same scale as one column's, and its tones
+    (frequency, Hz, and largest amplitude over the recordings); (0, ()) where no harmonic falls on one.
+    """
+    projector = Projector(problem, solution)
+    best = 0.0, ()
+    for mains in MAINS:
+        places = _on_harmonics(problem, mains)
+        if not places:
+            continue
+        columns = _projected(problem, projector, [(n, h, part) for n, h, _ in places for part in (1.0, 1j)])
+        size, *_ = np.linalg.lstsq(columns, -projector.residual, rcond=1e-6)
+        fall = float(projector.residual @ projector.residual - np.sum((projector.residual + columns @ size) ** 2))
+        z = float(np.sqrt(max(fall - len(size), 0.0)))
+        if z > best[0]:
+            amplitudes = 2 * np.hypot(size[::2], size[1::2])
+            orders = np.asarray([k for _, _, k in places])
+            tones = ((k * mains, float(max(amplitudes[orders == k], default=0.0))) for k in range(1, HUM_TONES + 1))
+            best = z, tuple(tones)
+    return best
+
+
+def _on_harmonics(problem, mains):
+    """(recording, harmonic, multiple of the mains) wherever a tone of the hum and a harmonic cannot be told apart."""
+    places = []
+    for n, s in enumerate(problem.spectra):
+        for k in range(1, HUM_TONES + 1):
+            h = round(k * mains / s.frequency)
+            if 1 <= h < problem.target.lines.shape[1] and abs(h * s.frequency - k * mains) < 0.6 * s.frequency / s.periods:
+                places.append((n, h, k))
+    return places
+
+
+def _projected(problem, projector, signals):
+    """Columns of unit signals at (recording, harmonic, complex amplitude), off the tangent space: (rows, signals)."""
+    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
+    rows = []
+    for recording, harmonic, amplitude in signals:
+        lines = np.zeros(problem.target.lines.shape, complex)
+        lines[recording, harmonic] = amplitude
+        rows.append(projector.project(np.asarray(whitened(jnp.asarray(lines), zero))))
+    return np.stack(rows, axis=1)

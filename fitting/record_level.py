@@ -1,0 +1,197 @@
+"""What is added to a whole record, whatever the drive: drift, heat and hum, scored between the harmonics of the drive.
+
+Each is told from the reading in the time domain, by the noise's spectrum; what was found is taken out of the recordings.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from magjax.recording import Recording
+
+from .spectra import fit_lines, reduce_recording, with_noise
+
+MAINS = (50.0, 60.0)
+HUM_TONES = 3
+OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record by itself, and the share of records that must show it
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordEffect:
+    """A record-level effect: amplitude common to the recordings with its score; `columns`: per recording."""
+
+    name: str
+    z: float
+    amplitude: float
+    stderr: float
+    shapes: dict
+    columns: tuple = dataclasses.field(repr=False, default=())
+
+
+def record_columns(recordings, spectra):
+    """(name, shapes, column per recording) of record-level effects at unit amplitude."""
+    rows = []
+    times = [s.dt * np.arange(s.samples) for s in spectra]
+    rows.append(("zero_drift", {}, [t for t in times]))
+    for tau in (0.3, 3.0, 30.0):
+        heat = []
+        for recording, t in zip(recordings, times, strict=True):
+            drive = np.asarray(recording.channels[recording.drive])
+            heat.append(np.mean(drive**2) * tau * (1 - np.exp(-t / tau)))
+        rows.append(("thermal_drift", {"tau": tau}, heat))
+    return rows
+
+
+def record_effects(recordings, spectra) -> list[RecordEffect]:
+    """Drift, heat and hum scored on what the harmonics leave, best first."""
+    found = {}
+    for name, shapes, columns in record_columns(recordings, spectra):
+        top, bottom = 0.0, 0.0
+        for s, column in zip(spectra, columns, strict=True):
+            weight, r, c = _between(s, column)
+            top += float(np.sum(weight * (np.conj(c) * r).real))
+            bottom += float(np.sum(weight * np.abs(c) ** 2))
+        z, amplitude = top / np.sqrt(bottom), top / bottom
+        if name not in found or abs(z) > abs(found[name].z):
+            found[name] = RecordEffect(name, float(z), float(amplitude), float(1 / np.sqrt(bottom)), shapes, tuple(columns))
+    if own := _own_drifts(spectra, found["zero_drift"].z):
+        found["zero_drift"] = own
+    for f in MAINS:
+        z, tones, fits = _hum(spectra, f)
+        if "mains_hum" not in found or z > found["mains_hum"].z:
+            error = tones[0][1] / max(z, 1.0)
+            found["mains_hum"] = RecordEffect(
+                "mains_hum", float(z), tones[0][1], float(error), {"f": f, "tones": tones}, tuple(fits)
+            )
+    return sorted(found.values(), key=lambda e: -abs(e.z))
+
+
+def hum_of(spectra, z: float, tones) -> RecordEffect:
+    """Hum known from harmonics that it falls on (`on_lines.hum_score`), joined to what shows of it between the others."""
+    between, shown, fits = _hum(spectra, tones[0][0], [a for _, a in tones])
+    both = tuple((f, max(a, b)) for (f, a), (_, b) in zip(tones, shown, strict=True))
+    z = float(np.hypot(z, between))
+    return RecordEffect("mains_hum", z, both[0][1], both[0][1] / max(z, 1.0), {"f": tones[0][0], "tones": both}, tuple(fits))
+
+
+def drift_of(s):
+    """The drift of one record by itself, straight and by the root of time, from zero at its start: (fall of chi2, samples)."""
+    t = s.dt * np.arange(s.samples)
+    parts = [t / t[-1], np.sqrt(t / t[-1])]
+    best, gain = _combination([_between(s, p) for p in parts])
+    return gain, sum(x * p for x, p in zip(best, parts, strict=True))
+
+
+def _combination(reduced, sizes=None):
+    """Amplitudes of columns of one record, as `_between` gives them, by least squares, and the fall of chi2; `sizes`: the
+    standard deviation of each that is known beforehand."""
+    G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
+    g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
+    known = 0.0 if sizes is None else np.diag(1 / np.square(sizes))
+    best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(len(G)) + known, g)
+    return best, float(best @ g)
+
+
+def _own_drifts(spectra, common: float) -> RecordEffect | None:
+    """Drift of each record by itself, where that serves better (BIC) than the `common` rate, scored by z; None elsewhere."""
+    gains, fits = zip(*(drift_of(s) for s in spectra), strict=True)
+    extra, count = 2 * len(spectra), sum(s.samples for s in spectra)
+    shown = np.mean(np.asarray(gains) > OWN_GAIN)  # a hum looks like a drift in short records only
+    if shown < OWN_SHARE or sum(gains) - common**2 < extra * np.log(count):
+        return None
+    ends = np.array([f[-1] / (s.dt * s.samples) for f, s in zip(fits, spectra, strict=True)])
+    rate = float(np.median(ends))
+    z = float(np.sqrt(max(sum(gains) - extra, 0.0)))
+    return RecordEffect("zero_drift", z, rate, float(np.std(ends) / np.sqrt(len(ends))), {"own": True}, fits)
+
+
+def _hum(spectra, mains, amplitudes=None):
+    """Hum of one mains frequency and its first harmonics, a phase of its own in each record: (z, tones, fits).
+
+    `tones`: (frequency, largest amplitude over the records) of each; a tone that falls on a harmonic of the drive cannot be
+    told from the reading there, and a record shorter than two of its periods tells no tone from slow noise: it takes no
+    part in the score, and its own tones are held to the size of the others', or to `amplitudes` where they are known.
+    """
+    longest = max(s.samples * s.dt for s in spectra)
+    frequencies = [k * mains for k in range(1, HUM_TONES + 1)]
+    gain, number, power, fits = 0.0, 0, np.zeros(HUM_TONES), {}
+    for s in sorted(spectra, key=lambda s: -s.samples * s.dt):
+        long = s.samples * s.dt >= min(2 / mains, longest * 0.999)
+        parts, kinds = _tones(s, frequencies)
+        if not parts:
+            fits[id(s)] = np.zeros(s.samples)
+            continue
+        known = power if amplitudes is None else np.asarray(amplitudes)
+        held = amplitudes is not None if long else known.any()
+        sizes = np.maximum(known[kinds], 1e-3 * known.max()) / np.sqrt(2) if held else None
+        best, fall = _combination([reduced for _, reduced in parts], sizes)
+        if long:
+            gain += fall
+            number += len(parts)
+            for k in set(kinds):
+                power[k] = max(power[k], float(np.linalg.norm(best[np.asarray(kinds) == k])))
+        fits[id(s)] = sum(x * p for x, (p, _) in zip(best, parts, strict=True))
+    z = np.sqrt(max(gain - number, 0.0))  # of the same scale as one column's score
+    return z, tuple((f, float(p)) for f, p in zip(frequencies, power, strict=True)), [fits[id(s)] for s in spectra]
+
+
+def _tones(s, frequencies):
+    """Cosine and sine of each tone that shows between the harmonics, with what `_between` makes of them; and which tone."""
+    t = s.dt * np.arange(s.samples)
+    parts, kinds = [], []
+    for k, f in enumerate(frequencies):
+        pair = [np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]
+        reduced = [_between(s, p) for p in pair]
+        seen = sum(np.sum(np.abs(c) ** 2) for _, _, c in reduced) / sum(np.sum(np.abs(np.fft.rfft(p)) ** 2) for p in pair)
+        if f < 0.45 / s.dt and seen > 0.05:
+            parts += list(zip(pair, reduced, strict=True))
+            kinds += [k, k]
+    return parts, kinds
+
+
+def _between(s, column):
+    """Weights, residue and column in the frequency domain, both without the harmonics."""
+    phases = np.arange(s.samples) * s.dt * s.frequency
+    left = fit_lines(np.asarray(column, float), phases, len(s.reading) - 1)[1]
+    f = np.fft.rfftfreq(s.samples, s.dt)
+    weight = 2.0 / (s.samples * s.noise.density(np.maximum(f, f[1])))
+    weight[0] = 0.0
+    return weight, np.fft.rfft(s.residue), np.fft.rfft(left)
+
+
+def remove_record_effect(recordings, effect, output):
+    """The recordings with a record-level signal taken out of the reading."""
+    cleaned = []
+    for recording, column in zip(recordings, effect.columns, strict=True):
+        signal = np.zeros(len(recording.time))
+        scale = 1.0 if effect.name == "mains_hum" or effect.shapes.get("own") else effect.amplitude
+        signal[: len(column)] = scale * column
+        if len(column) < len(signal):
+            signal[len(column) :] = signal[len(column) - 1]
+        channels = {**recording.channels, output: recording.channels[output] - signal}
+        origin = recording.origin
+        if effect.name == "mains_hum":
+            origin = {**origin, "hum": effect.shapes["tones"]}
+        elif effect.shapes.get("own"):
+            origin = {**origin, "drift": float(np.abs(column).max())}
+        cleaned.append(Recording(recording.time, channels, recording.noise, origin, recording.name))
+    return cleaned
+
+
+def remove_from_checks(recordings, adopted, bench):
+    """Check recordings without the record-level signals that were `adopted` from the others; each record's own drift and
+    hum are found between its own harmonics. Recordings that do not repeat come back as they are."""
+    cleaned = []
+    for recording in recordings:
+        for effect in adopted if recording.frequency() is not None else ():
+            spectra = with_noise([reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)])
+            if effect.name == "mains_hum":
+                columns = tuple(_hum(spectra, effect.shapes["f"], [a for _, a in effect.shapes["tones"]])[2])
+            elif effect.shapes.get("own"):
+                columns = (drift_of(spectra[0])[1],)
+            else:
+                same = [c for n, shapes, c in record_columns([recording], spectra) if (n, shapes) == (effect.name, effect.shapes)]
+                columns = tuple(same[0])
+            recording = remove_record_effect([recording], dataclasses.replace(effect, columns=columns), bench.output)[0]
+        cleaned.append(recording)
+    return cleaned

@@ -1,0 +1,41 @@
+"""Hum where it falls on harmonics of the drive: it repeats like the loop, and only the other recordings tell them apart."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from fitting.demo import concealed_actuator, record
+from fitting.diagnose import diagnose
+from fitting.fit import fit
+from fitting.on_lines import hum_score
+from magjax.bench import load_bench
+
+BENCH = load_bench("aa-050h")
+DRIVES = ((10, 0.8, 0.1), (25, 0.5, -0.2), (50, 0.6, 0.1), (100, 0.5, -0.1), (170, 0.7, 0.1), (230, 0.5, -0.2))
+HUM = 9e-8
+
+
+def recorded(hum=0.0):
+    rng = np.random.default_rng(5)
+    truth, rows = concealed_actuator(BENCH), []
+    for f, amplitude, offset in DRIVES:
+        row = record(truth, f, amplitude, offset, rng, f"{f} Hz")
+        wave = hum * np.sin(2 * np.pi * 50.0 * row.time + rng.uniform(0, 2 * np.pi))
+        rows.append(dataclasses.replace(row, channels={**row.channels, "displacement": row.channels["displacement"] + wave}))
+    return rows
+
+
+def test_nothing_scores_on_harmonics_of_the_mains_without_hum():
+    base = fit(recorded(), BENCH, refine=False)
+    z, tones = hum_score(base.problem, base.refined)
+    assert z < 5 and len(tones) == 3
+
+
+def test_hum_that_falls_on_harmonics_is_named_and_no_physics():
+    found = diagnose(recorded(HUM), BENCH)
+    assert found.verdict == "attributed" and [e["name"] for e in found.effects] == ["mains_hum"]
+    assert found.repaired.chi2_per_sample < 1.1 < 0.5 * found.base.chi2_per_sample
+    sizes = [p["value"] for p in found.effects[0]["parameters"].values()]
+    assert any(v == pytest.approx(HUM, rel=0.25) for v in sizes)
+    assert "falls from" in found.message
