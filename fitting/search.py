@@ -34,15 +34,15 @@ from .instruments import RINGING, mode_as_filter
 from .screen import screen
 from .setup import effect_parameters
 from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, SILENT_CHI2, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
-NEAR_RIVAL, MOST_RIVALS = (
-    0.3,
-    4,
-)  # share of what an early effect left, within which rivals are tried beside the later ones, and how many
+NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within which rivals are tried beside later ones; how many
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
+FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
+LEADS_WITHIN, RIVALS_OF_TWO, ALIKE = 5.0, 2, 0.05  # of the best's chi2, how many, and how far apart in theirs
+DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
 
@@ -82,12 +82,17 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
         best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
         if state.steps and best.drop < LEAST_SHARE * excess and chi2_of(state.current) > MISFIT * count:
             break
-        if state.steps and check and _predicts_worse(state.current.actuator, best.result.actuator, check, bench):
+        further = state.steps and check and not _decides(state.current, best, excess)
+        if further and _predicts_worse(state.current, best.result, check, bench):
             break
-        best, good, chosen = _finer(recordings, bench, state.current, best, good, chosen, excess, progress, choices.rest == "auto")
+        left = screened(best.result, choices)
+        if not state.steps and not _promises(best.result, left):
+            best, left = _of_two(recordings, bench, best, left, good, choices, chosen, progress)
+        asked = (recordings, bench, state.current, best, good, chosen, excess, progress)
+        best, good, chosen = _finer(*asked, choices.rest == "auto", not _promises(best.result, left))
         state.steps.append((best, rivals_of(best, good), good, state.current))
+        candidates = left if best.result is asked[3].result else screened(best.result, choices)
         state.current = best.result
-        candidates = screened(best.result, choices)
         let_go()
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         _backward(recordings, bench, state, chosen, count, progress)
@@ -144,9 +149,16 @@ def _needless(candidate, trials) -> bool:
     return candidate.name not in STRUCTURES and any(abs(candidate.z) < CLOSE * abs(t.candidate.z) for t in met)
 
 
+def _decides(current, best, excess) -> bool:
+    """Whether a further effect makes a clear misfit vanish: then check recordings need not show it, for what they ask of a
+    density that the others did not visit may outweigh it."""
+    met = best.result.chi2_per_sample < MISFIT
+    return current.chi2_per_sample > FAR_BESIDE and met and best.drop > DECISIVE * excess
+
+
 def _predicts_worse(before, after, check, bench) -> bool:
     """Does a further effect raise the error on check recordings, taken together in units of their noise?"""
-    rows = check_errors(before, after, check, bench)
+    rows = check_errors(before.actuator, after.actuator, check, bench)
     old, new = (sum((r[k] / (r["noise_rms"] or r["rms_before"])) ** 2 for r in rows) for k in ("rms_before", "rms_after"))
     return new > 1.02 * old
 
@@ -164,8 +176,9 @@ def _backward(recordings, bench, state, chosen, count, progress):
             continue
         say(f"without {name}", 0, state.current.chi2_per_sample)
         fewer = actuator.without_effect(name)
+        most = max(chi2_of(state.current) + MIN_DROP, 2 * chi2_of(state.current) - 0.95 * count)
         more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra, "start": state.current}
-        trial = fit(recordings, bench, actuator=fewer, extra=effect_parameters(fewer), **more)
+        trial = fit(recordings, bench, actuator=fewer, extra=effect_parameters(fewer), target=most, **more)
         rise = chi2_of(trial) - chi2_of(state.current)
         if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
             state.steps.remove(step)
@@ -239,7 +252,44 @@ def _commuted(recordings, bench, state, candidate, chosen, progress) -> bool:
     return found is swapped
 
 
-def _finer(recordings, bench, current, best, good, chosen, excess, progress, any_rest: bool = True):
+def _promises(result, candidates) -> bool:
+    """Whether a further effect promises more than half of a misfit: then the density waits, for a finer one would take it up."""
+    return bool(candidates) and result.chi2_per_sample > FAR_BESIDE and candidates[0].z ** 2 > HALF * _left_by(result)
+
+
+def _left_by(result) -> float:
+    return chi2_of(result) - 0.92 * result.data_count
+
+
+def _of_two(recordings, bench, best, left, good, choices, chosen, progress):
+    """The best and the scores beside it; or a rival's, with which a further effect explains what the best leaves.
+
+    One effect with shapes of its own imitates two others better than either of them alone.
+    """
+    if best.result.chi2_per_sample < MISFIT:
+        return best, left
+    tried = [best]
+    for rival in sorted((t for t in good if t is not best), key=lambda t: chi2_of(t.result)):
+        far = chi2_of(rival.result) > LEADS_WITHIN * chi2_of(best.result)
+        if far or len(tried) > RIVALS_OF_TWO:
+            break
+        if any(abs(chi2_of(t.result) / chi2_of(rival.result) - 1) < ALIKE for t in tried):  # of one family
+            continue
+        tried.append(rival)
+        scores = screened(rival.result, choices)
+        first, excess = scores[0], _left_by(rival.result)
+        if first.z**2 < HALF * excess or chi2_of(rival.result) - first.z**2 > chi2_of(best.result) - MIN_DROP:
+            continue
+        classes = {c.name: c for c in CATALOGUE}
+        pair = _to_the_end(recordings, bench, rival.result, first, classes[first.name], chosen, excess, progress)
+        cost = (rival.parameters + pair.parameters - best.parameters) * np.log(pair.result.data_count)
+        met = pair.physical and pair.result.chi2_per_sample < MISFIT
+        if met and chi2_of(pair.result) + cost < chi2_of(best.result) - max(BIC_DROP, HALF * _left_by(best.result)):
+            return rival, scores
+    return best, left
+
+
+def _finer(recordings, bench, current, best, good, chosen, excess, progress, any_rest: bool = True, any_density: bool = True):
     """The best with another start memory and with a finer density where it still leaves something: both were chosen under
     the misfit of the base. Where that changes them, the near rivals are tried again on the same.
 
@@ -256,7 +306,7 @@ def _finer(recordings, bench, current, best, good, chosen, excess, progress, any
         margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
         if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices
-    if chosen.knots is not None and FINER_FROM[0] < best.result.chi2_per_sample < REFINE_BESIDE:
+    if any_density and chosen.knots is not None and FINER_FROM[0] < best.result.chi2_per_sample < REFINE_BESIDE:
         found = fit(recordings, bench, choices=found, refine=True, **more).choices
     if found == chosen:
         return best, good, chosen
