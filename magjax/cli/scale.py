@@ -4,6 +4,8 @@ import json
 
 from magjax.errors import ConfigurationError
 
+PROFILE = ".profile"  # a bootstrap and a profile are two jobs: each has its own checkpoint
+
 
 def add_where(p, what: str) -> None:
     """Options for where the chunks run; `what` the checkpoint keeps."""
@@ -23,7 +25,7 @@ def add_intervals(p) -> None:
     )
     p.add_argument("--profile", metavar="NAMES", help="profile-likelihood intervals: R_eddy,xi or all")
     p.add_argument("--fleet", nargs="+", metavar="DIR", help="one fit a folder of recordings; a table of all in --out")
-    add_where(p, "what the bootstrap or the fleet has done")
+    add_where(p, f"what the bootstrap or the fleet has done (the profile beside it, FILE{PROFILE})")
 
 
 def executor_of(options):
@@ -80,9 +82,10 @@ def intervals(result, options, folder, progress):
         from fitting.scale import profile_intervals
 
         names = None if options.profile == "all" else options.profile.split(",")
-        found = profile_intervals(result, names, executor=executor, progress=progress)
+        kept = f"{options.checkpoint}{PROFILE}" if options.checkpoint else None
+        found = profile_intervals(result, names, executor=executor, checkpoint=kept, progress=progress)
         content["profile"] = found.as_dict()
-        texts.append(str(found))
+        texts += [str(found), f"  {found.outcome}"]
     return content, "\n".join(texts)
 
 

@@ -196,6 +196,14 @@ def test_profile_agrees_with_the_standard_error_where_it_is_quadratic(result):
     assert np.ptp(narrow.interval("mechanics.xi")) < 0.6 * np.ptp(found.interval("mechanics.xi"))
 
 
+def test_a_profile_goes_on_from_its_checkpoint(result, tmp_path):
+    whole = profile_intervals(result, ["xi"], checkpoint=tmp_path / "kept")
+    lines = (tmp_path / "kept").read_bytes().splitlines(keepends=True)
+    (tmp_path / "kept").write_bytes(b"".join(lines[:2]) + lines[2][:40])
+    again = profile_intervals(result, ["xi"], checkpoint=tmp_path / "kept")
+    assert again.outcome.resumed == 1 and again.as_dict() == whole.as_dict()
+
+
 def test_a_held_parameter_stays(result):
     problem = result.problem
     index = problem.layout.index("mechanics.f0")
