@@ -18,7 +18,6 @@ from .floors import data_problem, record_effects, remove_from_checks, remove_rec
 from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term
 from .locate import where
-from .placebo import placebo
 from .screen import offset_score
 from .search import SECOND_Z, screened, search
 from .setup import Choices, effect_parameters, spectra_of, with_held_masses
@@ -41,14 +40,12 @@ def diagnose(
     actuator=None,
     choices: Choices = Choices(),
     progress=None,
-    placebo_runs: int = 0,
 ) -> Diagnosis:
     """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
     reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
-    `placebo_runs`: fits of recordings that lack nothing, to see how often the screening would alarm. Returns a `Diagnosis`;
-    raises `RecordingError` where a recording cannot be used at all.
+    Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all.
     """
     bench = load_bench(bench)
     say = progress or (lambda *a: None)
@@ -59,7 +56,7 @@ def diagnose(
     spectra = spectra_of(recordings, bench, choices.harmonics)
     say("between the harmonics", 0, None)
     if alternation := alternating(recordings, spectra, bench.output):
-        asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress, "placebo_runs": placebo_runs}
+        asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress}
         return alternation.told(diagnose(alternation.cleaned, bench, **asked))
     held = effect_parameters(actuator)
     if problem := data_problem(recordings, spectra, bench.output):
@@ -81,11 +78,7 @@ def diagnose(
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), tuple(cleaned), bench, checks, _floors(plain), place, _absorbed(candidates, reached.tried)
     )  # fmt: skip
-    found = _concluded(evidence, progress)
-    if placebo_runs > 0:
-        alarms = placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress)
-        found = dataclasses.replace(found, placebo=alarms)
-    return _with_zero(found, zero, rival)
+    return _with_zero(_concluded(evidence, progress), zero, rival)
 
 
 def _concluded(evidence, progress) -> Diagnosis:

@@ -89,6 +89,34 @@ def intervals(result, options, folder, progress):
     return content, "\n".join(texts)
 
 
+def check_placebo(options) -> None:
+    """Refuse what cannot work before the diagnosis takes its time."""
+    executor_of(options)
+    if options.placebo < 0:
+        raise ConfigurationError(f"--placebo {options.placebo}; give 1 or more, 20 to see false alarms of one in ten")
+    if not options.placebo and (options.workers or options.scheduler or options.checkpoint):
+        raise ConfigurationError("--workers, --scheduler and --checkpoint serve the placebo; add --placebo 20")
+
+
+def with_placebo(found, recordings, options, progress):
+    """The diagnosis with how often the same search cries wolf on simulations of its final model."""
+    import dataclasses
+
+    from fitting.placebo import placebo
+
+    more = {"seed": options.seed, "executor": executor_of(options), "checkpoint": options.checkpoint, "progress": progress}
+    return dataclasses.replace(found, placebo=placebo(found.repaired or found.base, recordings, options.placebo, **more))
+
+
+def placebo_text(found) -> str:
+    """The placebo in one line."""
+    named = ", ".join(f"{name} {count}" for name, count in found["named"].items())
+    return (
+        f"  placebo: {found['false_alarms']} of {found['runs']} searches of simulations that lack nothing cried wolf"
+        f"{f' ({named})' if named else ''}; the screening alarmed in {found['screening_alarms']}, highest z = {max(found['highest_z']):.1f}"
+    )
+
+
 def run_fleet(options, choices, folder, progress) -> int:
     """magjax fit --fleet: fleet.csv and fleet.nc in the folder, a result folder for each actuator in it."""
     from fitting.result import write_atomically
