@@ -201,6 +201,6 @@ def test_wrong_use_is_one_line(arguments, word, capsys):
 def test_the_commands_of_the_page_parse():
     page = (ROOT / "docs" / "scale.md").read_text()
     lines = [line.split()[1:] for line in page.splitlines() if line.startswith("    magjax ")]
-    assert len(lines) == 4
+    assert len(lines) == 5
     for command, *arguments in lines:
         parser_of(command).parse_args(arguments)

@@ -270,7 +270,7 @@ def main():
         if "batch" in parts:
             content["batch"] = batch(result)
         if "workers" in parts:
-            grid = {"frequencies": FREQUENCIES, "amplitudes": AMPLITUDES}
+            grid = {"frequencies": FREQUENCIES, "amplitudes": AMPLITUDES, "offsets": (0.1,)}
 
             def swept(executor, progress):
                 return [v.values for v in sweep(result.actuator, **grid, executor=executor, progress=progress).data_vars.values()]
