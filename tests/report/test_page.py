@@ -300,7 +300,7 @@ def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
         "Where simulation and recordings differ",
         "Fitted recordings, before and after",
         "Parameter shifts",
-        "False alarms of the screening",
+        "Placebo",
     ):
         assert title in heads
     assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
