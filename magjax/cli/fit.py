@@ -136,6 +136,8 @@ def run_diagnose(arguments) -> int:
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
     if bench.output == "strain":
+        if options.placebo:
+            raise ConfigurationError("--placebo simulates recordings, and strain curves have a law instead; leave it out")
         return _diagnose_strain(options, bench, folder)
     from fitting.diagnose import Diagnosis, diagnose
     from fitting.setup import Choices
