@@ -90,12 +90,13 @@ def test_simulated_lines_are_those_of_the_fit(final):
 
 
 def test_wrong_use_is_one_line(capsys):
-    for arguments, word in (
-        (["--placebo", "-1"], "1 or more"),
-        (["--workers", "2"], "add --placebo"),
-        (["--workers", "0"], "1 or more"),
+    for bench, arguments, word in (
+        ("aa-050h", ["--placebo", "-1"], "1 or more"),
+        ("aa-050h", ["--workers", "2"], "add --placebo"),
+        ("aa-050h", ["--workers", "0"], "1 or more"),
+        ("strain-curves", ["--placebo", "2"], "leave it out"),
     ):
-        assert main(["diagnose", "a.csv", "--bench", "aa-050h", *arguments]) == 2
+        assert main(["diagnose", "a.csv", "--bench", bench, *arguments]) == 2
         message = capsys.readouterr().err
         assert word in message and message.count("\n") == 1
 
