@@ -19,7 +19,6 @@ from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term
 from .locate import where
 from .on_lines import hum_score, offset_score
-from .placebo import placebo
 from .record_level import hum_of, record_effects, remove_from_checks, remove_record_effect
 from .search import SECOND_Z, screened, search
 from .setup import Choices, effect_parameters, spectra_of, with_held_masses
@@ -43,14 +42,12 @@ def diagnose(
     actuator=None,
     choices: Choices = Choices(),
     progress=None,
-    placebo_runs: int = 0,
 ) -> Diagnosis:
     """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
     reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
-    `placebo_runs`: fits of recordings that lack nothing, to see how often the screening would alarm. Returns a `Diagnosis`;
-    raises `RecordingError` where a recording cannot be used at all.
+    Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all.
     """
     bench = load_bench(bench)
     say = progress or (lambda *a: None)
@@ -61,24 +58,24 @@ def diagnose(
     spectra = spectra_of(recordings, bench, choices.harmonics)
     say("between the harmonics", 0, None)
     if alternation := alternating(recordings, spectra, bench.output):
-        asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress, "placebo_runs": placebo_runs}
+        asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress}
         return alternation.told(diagnose(alternation.cleaned, bench, **asked))
     held = effect_parameters(actuator)
     if problem := data_problem(recordings, spectra, bench.output):
         base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress, refine=False)
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
     adopted, cleaned = _record_level(recordings, spectra, bench, choices)
-    return _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress, placebo_runs)
+    return _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress)
 
 
-def _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress, placebo_runs, plain=None) -> Diagnosis:
+def _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress, plain=None) -> Diagnosis:
     """The diagnosis of recordings `cleaned` of the record-level effects `adopted`; `plain`: their fit, where it is known."""
     if plain is None:
         plain = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
     if problem := wrong_bench(plain):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
     candidates = screened(plain, choices)
-    asked = bench, check, actuator, held, choices, progress, placebo_runs
+    asked = bench, check, actuator, held, choices, progress
     hummed = {"actuator": actuator, "extra": held, "choices": choices, "progress": progress}
     if found := _hum_on_harmonics(cleaned, adopted, bench, plain, candidates, hummed):
         return _examined(recordings, found[0], [*adopted, found[1]], *asked, plain=found[2])
@@ -95,11 +92,7 @@ def _examined(recordings, cleaned, adopted, bench, check, actuator, held, choice
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), tuple(cleaned), bench, checks, _floors(plain), place, _absorbed(candidates, reached.tried)
     )  # fmt: skip
-    found = _concluded(evidence, progress)
-    if placebo_runs > 0:
-        alarms = placebo(reached.current, Z_THRESHOLD, placebo_runs, without=choices.without, progress=progress)
-        found = dataclasses.replace(found, placebo=alarms)
-    return _with_zero(found, zero, rival)
+    return _with_zero(_concluded(evidence, progress), zero, rival)
 
 
 def _concluded(evidence, progress) -> Diagnosis:

@@ -120,6 +120,20 @@ def data_residual(problem: Problem, z):
     return np.asarray(_read_residual(problem.layout, jnp.asarray(z), problem.target, problem.template, predictor, marched))
 
 
+@eqx.filter_jit
+def _read_residuals(layout, z, lines, target, template, predictor):
+    actuators, levels = jax.vmap(lambda y: (layout.actuator(template, y), layout.levels(y)))(z)
+    found = predictor.lines_of_each(actuators, levels)
+    return jax.vmap(lambda own, measured: whitened(own, eqx.tree_at(lambda t: t.lines, target, measured)))(found, lines)
+
+
+def data_residuals(problem: Problem, z, lines):
+    """`data_residual` of several problems that differ in their measured lines alone, each at its own unknowns:
+    (problems, data) for (problems, unknowns) and (problems, recordings, harmonics + 1)."""
+    arguments = (problem.layout, jnp.asarray(z), jnp.asarray(lines), problem.target, problem.template, problem.predictors[1])
+    return np.asarray(_read_residuals(*arguments))
+
+
 def data_jacobian(problem: Problem, z):
     """Its Jacobian, (data, unknowns), on the coarse grid."""
     z, predictor = np.asarray(z, float), problem.predictors[0]

@@ -183,6 +183,33 @@ class Predictor(eqx.Module):
             at += drive.shape[0]
         return tuple(parts)
 
+    def lines_of_each(self, actuators, levels):
+        """As `self(actuator, levels)` for several actuators, the leading axis of every array: (actuators, recordings, harmonics + 1).
+
+        Actuators and recordings are one axis: nested ones are no quicker than one actuator after the other.
+        """
+
+        def one(actuator, drive, dt, level):
+            shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
+            line = Timeline(dt, drive.shape[0], True)
+            current = driven_current(actuator, drive, line)
+            H, M = march_chain(shifted, line, current, self.periods, self.corners)[:2]
+            zero = jnp.zeros(())
+            reading = finish_chain(actuator, line, drive, current, H, M, H, zero, zero).reading
+            return jnp.fft.rfft(reading)[: self.harmonics + 1] / drive.shape[0]
+
+        number, order = jax.tree.leaves(actuators)[0].shape[0], np.asarray(self.index)
+        levels = (jnp.zeros((number, len(order))) if levels is None else levels)[:, np.argsort(order)]
+        parts, at = [], 0
+        for drive, dt in zip(self.drives, self.steps, strict=True):
+            count = drive.shape[0]
+            rows = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), actuators)
+            own = levels[:, at : at + count].ravel()
+            found = jax.vmap(one)(rows, jnp.tile(drive, (number, 1)), jnp.tile(dt, number), own)
+            parts.append(found.reshape(number, count, -1))
+            at += count
+        return jnp.concatenate(parts, axis=1)[:, order]
+
     def lines(self, actuator, marched):
         """The reading's coefficients from what `march` gave: the blocks behind the hysteresis."""
 

@@ -1,43 +1,68 @@
-"""The placebo: does the screening alarm on recordings that lack nothing?
+"""The placebo: how often does the same search cry wolf on recordings that lack nothing?
 
-The final model stands in for the truth: its harmonics with fresh noise of the stated size are fitted and screened as the
-recordings were. What scores above the threshold there is a false alarm of the screening. It names nothing yet: the fits of
-the leaders with their gates, which a diagnosis goes on to, are not run here. A rough truth that the density cannot follow is not
-in it: that is what the check recordings and the blind suites are for.
+The final model stands in for the truth: its harmonics with fresh noise of the stated size are fitted, screened and searched as
+the recordings were. Where nothing scores above the threshold the search ends by its own rule, after some seconds; else the
+leaders are fitted beside their rivals and what does not earn its place is dropped. A run that adopts an effect cries wolf. A
+rough truth that the density cannot follow is not in it: that is what the check recordings and the blind suites are for.
 """
 
 import dataclasses
 
-import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
+from magjax.errors import ConfigurationError
+from magjax.scale import Chunk, Job, run_job
 
-from .joint import solve
-from .model import predicted_lines
-from .screen import screen
-from .uncertainty import UNDERSMOOTH
+from .fit import fit_or_stop as fit
+from .scale.bootstrap import model_lines, parametric_noise
+from .scale.refit import lean
+from .search import screened, search
+from .verdict import Z_THRESHOLD, too_little
 
 
-def placebo(result, threshold: float, runs: int = 20, seed: int = 0, without=(), progress=None) -> dict:
-    """Fit and screen the model's own recordings `runs` times; {"runs", "false_alarms", "named", "highest_z"}.
+def placebo(result, recordings, runs: int = 20, *, seed: int = 0, executor=None, checkpoint=None, progress=None) -> dict:
+    """Search `runs` simulations of the final model for what they do not lack: the entry "placebo" of diagnosis.json.
 
-    `result`: the `FitResult` of the final model; `threshold`: |z| of an alarm; `without`: effects that are not asked for.
+    `result`: the `FitResult` of the final model (repaired or base) of a `Diagnosis`; `recordings`: those of the diagnosis;
+    `executor`, `checkpoint`, `progress` as in `magjax.scale.run_job`, a run is a chunk. Raises `ConfigurationError` below one run.
     """
-    say = progress or (lambda *a: None)
-    random = np.random.default_rng(seed)
-    problem, solution = result.problem, result.solution
-    exact = np.asarray(predicted_lines(problem.predictors[1], problem.layout.actuator(problem.template, jnp.asarray(solution.z))))
-    deviations = np.where(np.isfinite(np.asarray(problem.target.deviations)), np.asarray(problem.target.deviations), 0.0)
-    named, highest = {}, []
-    for k in range(runs):
-        say(f"placebo {k + 1} of {runs}", 0, None)
-        noise = random.normal(size=exact.shape) + 1j * random.normal(size=exact.shape) * (np.arange(exact.shape[1]) > 0)
-        target = eqx.tree_at(lambda t: t.lines, problem.target, jnp.asarray(exact + deviations * noise))
-        again = dataclasses.replace(problem, target=target)
-        found = solve(again, solution.z, solution.weights, max_jacobians=8)
-        loose = solve(again, found.z, UNDERSMOOTH * found.weights, max_jacobians=4, evidence=False)
-        best = next(c for c in screen(again, loose) if c.name not in without)
-        highest.append(float(abs(best.z)))
-        if abs(best.z) > threshold:
-            named[best.name] = named.get(best.name, 0) + 1
-    return {"runs": runs, "false_alarms": sum(named.values()), "named": named, "highest_z": highest}
+    if runs < 1:
+        raise ConfigurationError(f"a placebo of {runs} runs; give 1 or more, 20 to see false alarms of one in ten")
+    lines = model_lines(result.problem, result.solution.z)
+    inputs = {"result": _timeless(result), "recordings": tuple(recordings), "lines": lines}
+    chunks = tuple(Chunk(f"run {k}", k) for k in range(runs))
+    if progress is not None:
+        progress(f"placebo, {runs} searches")
+    rows = run_job(Job("placebo", searched, inputs, chunks, seed), executor, checkpoint=checkpoint, progress=progress).results
+    named = [name for row in rows for name in row["named"]]
+    return {
+        "procedure": "search", "runs": runs, "false_alarms": sum(bool(row["named"]) for row in rows),
+        "named": {name: named.count(name) for name in dict.fromkeys(named)},
+        "screening_alarms": sum(row["highest_z"] >= Z_THRESHOLD for row in rows), "highest_z": [row["highest_z"] for row in rows],
+    }  # fmt: skip
+
+
+def _timeless(result):
+    """The fit without what differs between two runs of one command, and without what a search does not read."""
+    solution = dataclasses.replace(result.solution, seconds=0.0)
+    nothing = {"refined": None, "history": (), "compile_s": 0.0, "solve_s": 0.0}
+    return dataclasses.replace(result, problem=lean(result.problem), solution=solution, **nothing)
+
+
+def searched(inputs, number, rng) -> dict:
+    """One run: the effects that the search adopts, and the highest |z| of the screening that it began with."""
+    result, recordings = inputs["result"], inputs["recordings"]
+    lines = inputs["lines"] + parametric_noise(result.problem.target, rng)
+    spectra = tuple(_reading(s, row) for s, row in zip(result.spectra, lines, strict=True))
+    own = tuple(n for n in result.problem.layout.names if n not in result.bench.free)
+    asked = {"actuator": result.actuator, "extra": own, "choices": result.choices, "refine": False}
+    base = fit(recordings, result.bench, **asked, start=result, spectra=spectra)
+    candidates = screened(base, result.choices)
+    reached = search(recordings, result.bench, base, candidates, result.choices, None)
+    named = [] if too_little(reached, base) else [best.name for best, *_ in reached.steps]
+    return {"named": named, "highest_z": max((float(abs(c.z)) for c in candidates), default=0.0)}
+
+
+def _reading(spectrum, lines):
+    """The spectrum with other reading lines; those beyond the fit's stay."""
+    reading = spectrum.reading.copy()
+    reading[: len(lines)] = lines
+    return dataclasses.replace(spectrum, reading=reading)

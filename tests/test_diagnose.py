@@ -12,7 +12,6 @@ from fitting.attribute import Trial, chi2_of
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
-from fitting.placebo import placebo
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
@@ -37,15 +36,12 @@ def study(bench, effect=None, seed=5):
 
 def test_silent_where_nothing_is_missing(bench):
     runs, checks = study(bench)
-    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250), placebo_runs=2)
+    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250))
     assert (
         found.verdict == "nothing_missing"
         and "nothing of the catalogue is missing" in str(found)
         and "A wrong c0, H_bias or lambda_s in" in str(found)
     )
-    assert found.placebo["runs"] == 2 and found.placebo["false_alarms"] == 0 and 0 < max(found.placebo["highest_z"]) < 5.5
-    low = placebo(found.base, 1e-3, 1)  # everything scores above nothing
-    assert low["false_alarms"] == 1 and sum(low["named"].values()) == 1
     assert not found.effects and not found.groups and found.repaired is None
     assert {"linear_strain", "mean_field", "reversible_magnetization"} <= set(found.absorbed)
     assert max(abs(c.z) for c in found.candidates) < 5.5

@@ -340,32 +340,34 @@ def _shifts(found):
 
 
 def placebo_section(placebo, verdict):
-    """How often the screening alarms on recordings that lack nothing; or that this was not tried, and how to."""
-    title = "False alarms of the screening"
+    """How often the search cries wolf on recordings that lack nothing; or that this was not tried, and how to."""
+    title = "Placebo"
     if not placebo:
         if verdict == "data_problem":
             return None
         text = (
-            "Not tried. The final model is simulated on the same drives with fresh noise; those recordings are fitted and screened, and it is "
-            "counted how often something scores above the threshold, though nothing more is there."
+            "Not tried. The final model is simulated on the same drives with fresh noise, those recordings are searched as the measured ones "
+            "were, and it is counted how often the search adopts an effect though nothing more is there."
         )
         return section(title, part(text=text), part(text=RUN_PLACEBO))
-    number = next((int(placebo[k]) for k in ("runs", "searches", "count", "n", "trials") if k in placebo), 0)
-    false = next((int(placebo[k]) for k in ("false_alarms", "named", "named_more", "alarms", "cried_wolf") if k in placebo), None)
-    parts = []
-    if number and false is not None:
-        low, high = interval(false, number)
-        parts.append(
-            part(
-                text=f"In {false} of {number} sets of recordings simulated from the final model something scored above the threshold, where "
-                f"nothing more was ({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)}). An alarm names nothing yet: a "
-                "diagnosis goes on to fit what alarms beside its rivals, and drops what does not earn its place; that was not done here."
-            )  # fmt: skip
+    number, false, table = placebo["runs"], placebo["false_alarms"], "The same search on recordings that lack nothing"
+    low, high = interval(false, number)
+    share = f"({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)})"
+    if placebo.get("procedure") == "search":
+        scored = placebo["screening_alarms"]
+        text = (
+            f"In {false} of {number} sets of recordings simulated from the final model the same search adopted an effect, where nothing more "
+            f"was {share}. In {scored} of them something scored above the threshold of the screening and was fitted beside its rivals; in the "
+            "others the search ended there by its own rule."
+        )
+    else:  # a folder written when the screening alone was repeated
+        table = "The screening of recordings that lack nothing"
+        text = (
+            f"In {false} of {number} sets of recordings simulated from the final model something scored above the threshold, where nothing more "
+            f"was {share}. Only the screening was repeated: an alarm names nothing yet."
         )
     rows = [[words(str(k)), _shown(v)] for k, v in placebo.items()]
-    return section(
-        title, *parts, part(table=tables.table("The screening of recordings that lack nothing", ["quantity", "value"], rows))
-    )
+    return section(title, part(text=text), part(table=tables.table(table, ["quantity", "value"], rows)))
 
 
 def _shown(value) -> str:

@@ -59,9 +59,11 @@ def _panel(figure, left, values, lower, seen, levels, unit, label, title):
     drawn = axes.imshow(shown, origin="lower", extent=extent, cmap=SEQUENTIAL, norm=PowerNorm(0.5, 0, top), interpolation="nearest")
     unseen = lower & ~seen
     if unseen.any():
-        middle = 0.5 * (levels[1:] + levels[:-1])
-        with_edges = unseen.astype(float)
-        axes.contourf(middle, middle, with_edges, levels=[0.5, 1.5], colors=["#ededed"], hatches=["////"])
+        # each cell by two points just inside its edges, so that the outline runs along them
+        inside = 1e-6 * (levels[1] - levels[0])
+        ends = np.stack([levels[:-1] + inside, levels[1:] - inside], axis=1).ravel()
+        cells = unseen.astype(float).repeat(2, axis=0).repeat(2, axis=1)
+        axes.contourf(ends, ends, cells, levels=[0.5, 1.5], colors=["#ededed"], hatches=["////"])
     axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color=MUTED, lw=0.6)
     axes.set(xlabel=f"β / ({unit})", ylabel=f"α / ({unit})", xlim=extent[:2], ylim=extent[2:])
     axes.set_title(title, loc="left", color=INK)

@@ -15,9 +15,9 @@ from magjax.errors import ConfigurationError
 from magjax.scale import Chunk, Job, run_job
 
 from ..joint import data_residual
-from .refit import lean, settle, with_lines
+from .refit import BATCH, lean, settle, settle_each
 
-CHUNK = 10  # draws that are done and kept together
+CHUNK = BATCH  # draws that are done and kept together
 KINDS = ("parametric", "blocks")
 FEWEST_PERIODS = 3  # to draw blocks from
 
@@ -142,16 +142,12 @@ def bootstrap_intervals(
 
 def draw(inputs, count, rng):
     """A chunk of draws: parameters (draws, names), chi2 and whether each settled."""
-    problem, rows = inputs["problem"], []
-    for _ in range(count):
-        noise = parametric_noise(problem.target, rng) if inputs["blocks"] is None else block_noise(inputs["blocks"], rng)
-        drawn = with_lines(problem, inputs["lines"] + noise)
-        found = settle(drawn, inputs["z"], inputs["weights"], jacobian=inputs["jacobian"])
-        rows.append(
-            ([float(problem.layout.value(n, jnp.asarray(found.z))) for n in problem.layout.names], found.chi2, found.converged)
-        )
-    values, chi2, converged = zip(*rows, strict=True)
-    return {"values": np.asarray(values), "chi2": np.asarray(chi2), "converged": np.asarray(converged)}
+    problem, blocks = inputs["problem"], inputs["blocks"]
+    noise = [parametric_noise(problem.target, rng) if blocks is None else block_noise(blocks, rng) for _ in range(count)]
+    found = settle_each(problem, inputs["lines"] + np.asarray(noise), inputs["z"], inputs["weights"], inputs["jacobian"])
+    z = jnp.asarray(np.stack([s.z for s in found]).T)
+    values = np.stack([np.asarray(problem.layout.value(n, z)) for n in problem.layout.names], axis=1)
+    return {"values": values, "chi2": np.asarray([s.chi2 for s in found]), "converged": np.asarray([s.converged for s in found])}
 
 
 def coloured(target, white):

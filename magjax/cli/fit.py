@@ -7,7 +7,7 @@ from pathlib import Path
 from magjax.errors import ConfigurationError, MagjaxError
 
 from .runtime import Progress, output_folder, parser, prepare_jax, told
-from .scale import add_intervals, check_intervals, intervals, run_fleet
+from .scale import add_intervals, add_where, check_intervals, check_placebo, intervals, placebo_text, run_fleet, with_placebo
 
 
 def run(command: str, arguments: list[str]) -> int:
@@ -124,8 +124,10 @@ def run_diagnose(arguments) -> int:
         "--calibration", nargs="+", default=[], help="the sensor moved by a known amount: files with reference_m beside the reading"
     )
     p.add_argument("--placebo", type=int, default=0, metavar="N",
-                   help="fit and screen N simulated recordings that lack nothing: how often the screening alarms falsely (its fits of rivals are not run; some seconds each)")  # fmt: skip
+                   help="search N simulations of the final model for what they do not lack: how often the search cries wolf (some seconds each, more where the screening alarms)")  # fmt: skip
+    add_where(p, "the placebo's finished searches")
     options = p.parse_args(arguments)
+    check_placebo(options)
     prepare_jax()
     from magjax.errors import RecordingError
     from magjax.readers import load_calibrations
@@ -134,17 +136,24 @@ def run_diagnose(arguments) -> int:
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
     if bench.output == "strain":
+        if options.placebo:
+            raise ConfigurationError("--placebo simulates recordings, and strain curves have a law instead; leave it out")
         return _diagnose_strain(options, bench, folder)
     from fitting.diagnose import Diagnosis, diagnose
     from fitting.setup import Choices
 
-    recordings, checks = [], []
+    recordings, checks, stopped = [], [], None
     try:
         recordings = load_recordings(options.recordings, bench)
         checks = load_recordings(options.check, bench) if options.check else []
         with Progress(options.quiet) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
-                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress, placebo_runs=options.placebo)  # fmt: skip
+                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress)  # fmt: skip
+            if options.placebo and found.verdict != "data_problem":
+                try:
+                    found = with_placebo(found, recordings, options, progress)
+                except (MagjaxError, KeyboardInterrupt) as error:  # the diagnosis itself is done and is kept
+                    stopped = error
     except RecordingError as error:
         found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
     content = found.as_dict()
@@ -160,11 +169,11 @@ def run_diagnose(arguments) -> int:
         for row in found.candidates[:8]:
             print(f"  {row.name:26s} z = {row.z:8.1f}   visible from {row.smallest_visible:.3g}")
         if found.placebo:
-            print(
-                f"  false alarms of the screening: {found.placebo['false_alarms']} in {found.placebo['runs']} runs, highest z = {max(found.placebo['highest_z']):.1f}"
-            )
+            print(placebo_text(found.placebo))
         if folder:
             print(f"\nresults in {folder} (report.html, diagnosis.json)")
+    if stopped is not None:
+        raise stopped
     return 3 if found.verdict == "data_problem" else 0
 
 

@@ -4,6 +4,8 @@ import json
 
 from magjax.errors import ConfigurationError
 
+PROFILE = ".profile"  # a bootstrap and a profile are two jobs: each has its own checkpoint
+
 
 def add_where(p, what: str) -> None:
     """Options for where the chunks run; `what` the checkpoint keeps."""
@@ -23,7 +25,7 @@ def add_intervals(p) -> None:
     )
     p.add_argument("--profile", metavar="NAMES", help="profile-likelihood intervals: R_eddy,xi or all")
     p.add_argument("--fleet", nargs="+", metavar="DIR", help="one fit a folder of recordings; a table of all in --out")
-    add_where(p, "what the bootstrap or the fleet has done")
+    add_where(p, f"what the bootstrap or the fleet has done (the profile beside it, FILE{PROFILE})")
 
 
 def executor_of(options):
@@ -80,10 +82,39 @@ def intervals(result, options, folder, progress):
         from fitting.scale import profile_intervals
 
         names = None if options.profile == "all" else options.profile.split(",")
-        found = profile_intervals(result, names, executor=executor, progress=progress)
+        kept = f"{options.checkpoint}{PROFILE}" if options.checkpoint else None
+        found = profile_intervals(result, names, executor=executor, checkpoint=kept, progress=progress)
         content["profile"] = found.as_dict()
-        texts.append(str(found))
+        texts += [str(found), f"  {found.outcome}"]
     return content, "\n".join(texts)
+
+
+def check_placebo(options) -> None:
+    """Refuse what cannot work before the diagnosis takes its time."""
+    executor_of(options)
+    if options.placebo < 0:
+        raise ConfigurationError(f"--placebo {options.placebo}; give 1 or more, 20 to see false alarms of one in ten")
+    if not options.placebo and (options.workers or options.scheduler or options.checkpoint):
+        raise ConfigurationError("--workers, --scheduler and --checkpoint serve the placebo; add --placebo 20")
+
+
+def with_placebo(found, recordings, options, progress):
+    """The diagnosis with how often the same search cries wolf on simulations of its final model."""
+    import dataclasses
+
+    from fitting.placebo import placebo
+
+    more = {"seed": options.seed, "executor": executor_of(options), "checkpoint": options.checkpoint, "progress": progress}
+    return dataclasses.replace(found, placebo=placebo(found.repaired or found.base, recordings, options.placebo, **more))
+
+
+def placebo_text(found) -> str:
+    """The placebo in one line."""
+    named = ", ".join(f"{name} {count}" for name, count in found["named"].items())
+    return (
+        f"  placebo: {found['false_alarms']} of {found['runs']} searches of simulations that lack nothing cried wolf"
+        f"{f' ({named})' if named else ''}; the screening alarmed in {found['screening_alarms']}, highest z = {max(found['highest_z']):.1f}"
+    )
 
 
 def run_fleet(options, choices, folder, progress) -> int:

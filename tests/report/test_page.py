@@ -300,7 +300,7 @@ def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
         "Where simulation and recordings differ",
         "Fitted recordings, before and after",
         "Parameter shifts",
-        "False alarms of the screening",
+        "Placebo",
     ):
         assert title in heads
     assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
@@ -321,10 +321,12 @@ def test_a_misfit_that_is_no_number_is_never_a_verdict(folders, tmp_path):
 
 
 def test_the_placebo_panel():
-    said = placebo_section({"runs": 20, "false_alarms": 1, "named": {"creep": 1}}, "attributed")
-    text = json.dumps(said)
-    assert "1 of 20 sets" in text and "creep: 1" in text
-    assert "screening" in text and "An alarm names nothing yet" in text and "searches" not in text  # no rivals were fitted
+    counted = {"runs": 20, "false_alarms": 1, "named": {"creep": 1}, "highest_z": [3.0, 6.1]}
+    text = json.dumps(placebo_section({"procedure": "search", "screening_alarms": 2, **counted}, "attributed"))
+    assert "In 1 of 20 sets" in text and "search adopted an effect" in text and "In 2 of them something scored" in text
+    assert "creep: 1" in text and "(5 %; 95 % interval < 1 % to 24 %)" in text
+    older = json.dumps(placebo_section(counted, "attributed"))  # a folder of before: no rivals were fitted
+    assert "Only the screening was repeated" in older and "search adopted" not in older
     assert "Not tried" in json.dumps(placebo_section(None, "attributed"))
     assert placebo_section(None, "data_problem") is None
     low, high = interval(0, 20)

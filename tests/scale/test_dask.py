@@ -53,7 +53,7 @@ def test_no_scheduler_there(monkeypatch):
 def test_the_blind_suite_over_a_cluster(cluster, tmp_path):
     """Cases that are done already: the cluster finds their results and runs none."""
     from tests.blind.cases import make_case
-    from tests.studies.blind_cluster import over_dask
+    from tests.blind.run import run_cases
 
     rows = []
     for number in (0, 2):
@@ -61,4 +61,4 @@ def test_the_blind_suite_over_a_cluster(cluster, tmp_path):
         folder.mkdir()
         rows.append({"name": folder.name, "status": 0, "seconds": 61.5})
         (folder / "done.json").write_text(json.dumps(rows[-1]))
-    assert over_dask("dev", (0, 2), tmp_path, cluster.scheduler_address) == rows
+    assert run_cases("dev", (0, 2), tmp_path, f"dask:{cluster.scheduler_address}").results == rows

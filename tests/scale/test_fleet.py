@@ -2,6 +2,9 @@
 
 import csv
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,7 @@ from magjax.model_file import load_model
 from magjax.writers import write_recording
 from tests.scale.conftest import SINES
 
+ROOT = Path(__file__).resolve().parents[2]
 RESISTANCES = (50.0, 62.0, 75.0)
 
 
@@ -126,6 +130,35 @@ def test_intervals_on_the_command_line(folders, tmp_path, capsys):
     assert (out / "bootstrap.nc").exists()
 
 
+KILLED = """
+import os, signal, sys
+from magjax.cli import main
+from magjax.scale.checkpoint import Checkpoint
+add = Checkpoint.add
+def third(self, *row):
+    add(self, *row)
+    if len(self.done) == 3 and self.path.suffix == ".profile":
+        os.kill(os.getpid(), signal.SIGKILL)
+Checkpoint.add = third
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.long
+def test_a_killed_profile_goes_on(folders, tmp_path, capsys):
+    """kill -9 after three of six ends; the same command again takes them over, and the numbers are those of a whole one."""
+    files, kept = [str(p) for p in sorted((folders / "rod1").glob("rec_*.csv"))], tmp_path / "kept"
+    command = ["fit", *files, "--bench", "aa-050h", "--profile", "all", "--quiet"]
+    ended = subprocess.run([sys.executable, "-c", KILLED, *command, "--checkpoint", str(kept)], cwd=ROOT)
+    assert ended.returncode == -signal.SIGKILL
+    assert (tmp_path / "kept.profile").read_bytes().count(b"\n") == 4  # the header and three ends
+    assert main([*command, "--checkpoint", str(kept), "--out", str(tmp_path / "resumed")]) == 0
+    assert "6 chunks in" in (said := capsys.readouterr().out) and "3 from the checkpoint" in said
+    assert main([*command, "--out", str(tmp_path / "whole")]) == 0
+    resumed, whole = (json.loads((tmp_path / name / "fit.json").read_text())["profile"] for name in ("resumed", "whole"))
+    assert resumed == whole
+
+
 def test_a_fit_is_kept_where_its_intervals_fail(folders, result, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("fitting.fit.fit", lambda *_, **__: result)
     files = [str(p) for p in sorted((folders / "rod1").glob("rec_*.csv"))]
@@ -166,8 +199,8 @@ def test_wrong_use_is_one_line(arguments, word, capsys):
 
 
 def test_the_commands_of_the_page_parse():
-    page = (Path(__file__).resolve().parents[2] / "docs" / "scale.md").read_text()
+    page = (ROOT / "docs" / "scale.md").read_text()
     lines = [line.split()[1:] for line in page.splitlines() if line.startswith("    magjax ")]
-    assert len(lines) == 4
+    assert len(lines) == 5
     for command, *arguments in lines:
         parser_of(command).parse_args(arguments)

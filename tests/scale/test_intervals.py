@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from fitting.model import Target, whitened
 from fitting.scale import bootstrap_intervals, profile_intervals
 from fitting.scale.bootstrap import block_noise, model_lines, parametric_noise, period_lines
 from fitting.scale.profile import full_names, held, walk
-from fitting.scale.refit import settle, with_lines
+from fitting.scale.refit import settle, settle_each, with_lines
 from fitting.spectra import Spectrum, gain_rows
 from fitting.uncertainty import WIDEN
 from magjax.errors import ConfigurationError
@@ -81,6 +82,37 @@ def test_settling_from_afar_ends_at_the_optimum(result):
         stderr = result.estimate(name).stderr / problem.layout.slope(name, centre.z)
         assert abs(back.z[k] - centre.z[k]) < 0.1 * stderr
     assert not settle(problem, away, weights, jacobian=0 * centre.jacobian, jacobians=0).converged
+
+
+def test_refits_side_by_side_are_those_one_by_one(result):
+    problem, weights, rng = result.problem, result.refined.weights, np.random.default_rng(8)
+    centre = settle(problem, result.refined.z, weights)
+    lines = model_lines(problem, centre.z) + np.stack([parametric_noise(problem.target, rng) for _ in range(12)])
+    found = settle_each(problem, lines, centre.z, weights, centre.jacobian)
+    alone = [settle(with_lines(problem, row), centre.z, weights, jacobian=centre.jacobian) for row in lines]
+    scatter = np.std([s.z for s in alone], axis=0) + 1e-12
+    for one, other in zip(found, alone, strict=True):
+        assert one.converged and other.converged and one.chi2 == pytest.approx(other.chi2, rel=1e-9)
+        assert np.abs((one.z - other.z) / scatter).max() < 1e-6
+    # a draw's numbers do not depend on how many there are, nor on its neighbours
+    few = settle_each(problem, lines[:3], centre.z, weights, centre.jacobian)
+    assert all(np.array_equal(a.z, b.z) for a, b in zip(few, found, strict=False))
+    # where the Jacobian does not serve, a draw takes its own
+    (lost,) = settle_each(problem, lines[:1], centre.z, weights, -centre.jacobian)
+    assert lost.converged and lost.jacobians and lost.chi2 == pytest.approx(alone[0].chi2, rel=1e-3)
+
+
+def test_lines_of_each_on_several_grids(result):
+    """Two grids whose recordings stand in another order among all, and levels of their own."""
+    one, problem = result.problem.predictors[1], result.problem
+    drive, dt = one.drives[0], one.steps[0]
+    two = dataclasses.replace(one, drives=(drive[:2], drive[2:, ::2]), steps=(dt[:2], 2 * dt[2:]), index=(1, 2, 0))
+    z = jnp.asarray(np.stack([result.refined.z, 1.01 * result.refined.z]))
+    levels = jnp.asarray([[300.0, -200.0, 100.0], [0.0, 50.0, -400.0]])
+    actuators = [problem.layout.actuator(problem.template, row) for row in z]
+    found = two.lines_of_each(jax.vmap(lambda row: problem.layout.actuator(problem.template, row))(z), levels)
+    expected = np.stack([two(a, own) for a, own in zip(actuators, levels, strict=True)])
+    assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
 def target(scales=0.01):
@@ -162,6 +194,14 @@ def test_profile_agrees_with_the_standard_error_where_it_is_quadratic(result):
     narrow = profile_intervals(result, ["xi"], level=0.68)
     assert narrow.names == ("mechanics.xi",) and "68 %" in str(narrow)
     assert np.ptp(narrow.interval("mechanics.xi")) < 0.6 * np.ptp(found.interval("mechanics.xi"))
+
+
+def test_a_profile_goes_on_from_its_checkpoint(result, tmp_path):
+    whole = profile_intervals(result, ["xi"], checkpoint=tmp_path / "kept")
+    lines = (tmp_path / "kept").read_bytes().splitlines(keepends=True)
+    (tmp_path / "kept").write_bytes(b"".join(lines[:2]) + lines[2][:40])
+    again = profile_intervals(result, ["xi"], checkpoint=tmp_path / "kept")
+    assert again.outcome.resumed == 1 and again.as_dict() == whole.as_dict()
 
 
 def test_a_held_parameter_stays(result):

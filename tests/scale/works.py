@@ -14,6 +14,11 @@ def spectrum(inputs, item, rng):
     return {"item": item, "lines": np.abs(np.fft.rfft(inputs["signal"] + noise)), "mean": float(noise.mean()), "worker": None}
 
 
+def nothing(inputs, item, rng):
+    """An empty chunk."""
+    return {}
+
+
 def named(inputs, item, rng):
     """As `spectrum`, with the number of the process."""
     return {**spectrum(inputs, item, rng), "worker": os.getpid()}
