@@ -17,6 +17,7 @@ from magjax.errors import ConfigurationError
 from magjax.inverse import PlainStack, voltage_for_displacement
 from magjax.recording import load_recordings
 from magjax.simulate import simulate, sweep
+from tests import readme
 
 DRIVES = ((70, 70, 1), (40, 70, 10), (55, 75, 100), (25, 40, 3), (45, 60, 30), (60, 75, 50))  # V about V at Hz; the last checks
 NOISE = 4e-3  # um
@@ -224,6 +225,18 @@ def test_the_normal_matrix_is_that_of_the_weights_returned(tmp_path):
     assert np.linalg.eigvalsh(left).min() > -1e-6 * np.linalg.eigvalsh(J.T @ J).max()
 
 
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (["emulate", "--bench", "piezo-stack", "--link", "none"], "is driven by a voltage, these devices by a current"),
+        (["control", "design", "--bench", "piezo-stack"], "magjax invert gives the voltage"),
+    ],
+)
+def test_what_a_stack_cannot_do_is_one_line(command, words, capsys):
+    assert main(command) == 2
+    assert words in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_creep_that_was_concealed_is_named(tmp_path):
     from fitting import diagnose
@@ -234,3 +247,15 @@ def test_creep_that_was_concealed_is_named(tmp_path):
     assert found.check[0]["rms_after"] < 2e-6 * NOISE < found.check[0]["rms_before"]
     assert found.effects[0]["parameters"]["gain"]["value"] == pytest.approx(0.015, rel=0.2)
     assert not {c.name for c in found.candidates} & {"eddy_currents", "magnetic_aftereffect", "thermal_drift"}
+
+
+@pytest.mark.long
+def test_the_page_of_transducers_is_true(tmp_path):
+    """Its script and commands are typed as they stand; what comes back has the shape that it states."""
+    wrong = []
+    for block in readme.blocks((readme.ROOT / "docs" / "transducers.md").read_text(encoding="utf-8")):
+        if block.kind == "file":
+            (tmp_path / block.target).write_text(block.content)
+        else:
+            wrong += [readme.differs(expected, readme.run(command, tmp_path), block) for command, expected in block.steps()]
+    assert wrong and not [w for w in wrong if w]
