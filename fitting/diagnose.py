@@ -148,7 +148,7 @@ def _sensor_zero(recordings, bench, base, candidates, actuator, held, choices, p
     Returns the base, its candidates, the zero, m, or None, and the zero that would explain as much as the best effect, or None.
     """
     as_it_is = base, candidates, None, None
-    if bench.output != "displacement" or "sensor.offset" in bench.free:
+    if bench.output != "displacement" or bench.drive == "voltage" or "sensor.offset" in bench.free:
         return as_it_is
     best, excess = max((c.z**2 for c in candidates), default=0.0), chi2_of(base) - 0.92 * base.data_count
     score = offset_score(base.problem, base.refined) ** 2
@@ -191,7 +191,8 @@ def _record_level(recordings, spectra, bench, choices):
     """Drift, heat and hum, scored between the harmonics: (adopted with their rivals, the recordings without them)."""
     adopted = []
     for _ in range(0 if _quasistatic(bench) or bench.output != "displacement" else 2):
-        found = [e for e in record_effects(recordings, spectra) if e.name not in {a.name for a, _ in adopted}]
+        known = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
+        found = [e for e in record_effects(recordings, spectra) if e.name not in known]
         best = found[0]
         if abs(best.z) < RECORD_Z:
             break

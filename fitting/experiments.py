@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from magjax.errors import MagjaxError
+from magjax.terms import DRIVE_UNITS
 
 from .model import Predictor, whitened
 from .solver import jacobian
@@ -70,7 +71,7 @@ def next_experiment(trials, spectra, bench, also=()) -> dict | None:
     parts = [f"record {' and '.join(wanted)}"] if wanted else []
     if best is not None:
         f, A, offset = drives[best]
-        unit = "A" if bench.drive == "current" else "A/m"
+        unit = DRIVE_UNITS[bench.drive]
         odds = np.minimum(ndtr(0.5 * apart[best]), 0.99)
         sine = f"four settled periods of {A:.3g} {unit} at {f:.4g} Hz about {offset:.3g} {unit}"
         if odds.min() >= SURE or not wanted:
@@ -100,7 +101,7 @@ def menu(spectra, bench) -> list[tuple[float, float, float]]:
     phases = np.arange(200) / 200
     drives = [s.drive_at(phases) for s in spectra]
     low, high = min(d.min() for d in drives), max(d.max() for d in drives)
-    limit = float(bench.limits.get("current_A", bench.limits.get("field_A_per_m", np.inf)))
+    limit = float(bench.limit or np.inf)
     low, high = max(low, -limit), min(high, limit)
     seen = np.array([s.frequency for s in spectra])
     frequencies = {0.5 * seen.min(), np.sqrt(seen.min() * seen.max()), seen.max(), 1.5 * seen.max(), 2 * seen.max()}

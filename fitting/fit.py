@@ -73,7 +73,7 @@ def fit(
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
     if refine and choices.knots is not None and not solution.interrupted:
-        highest = REFINE_MATERIAL if bench.drive == "field" else REFINE_BESIDE if actuator.effects else REFINE_BELOW
+        highest = REFINE_MATERIAL if bench.drive != "current" else REFINE_BESIDE if actuator.effects else REFINE_BELOW
         highest = highest if refine is True else refine
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report, highest)
     return dataclasses.replace(finish(problem, solution, choices, bench, recordings, warm), history=tuple(history))

@@ -207,11 +207,12 @@ def solve(
     residual = data_residual(problem, z)
     chi2 = float(residual @ residual)
     cost = 0.5 * (chi2 + z @ prior @ z)
-    normal, path, gains = prior, [chi2], []
+    information, path, gains = np.zeros_like(prior), [chi2], []
     try:
         for taken in range(1, max_jacobians + 1):
             J = data_jacobian(problem, z)
-            normal, gradient = J.T @ J + prior, J.T @ residual + prior @ z
+            information = J.T @ J
+            normal, gradient = information + prior, J.T @ residual + prior @ z
             good = False
             for _ in range(8):
                 new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounded))
@@ -262,4 +263,6 @@ def solve(
                 damping = min(damping, 1e2)
     except KeyboardInterrupt:
         converged, interrupted = False, True
+    # under the weights that are returned: they may have moved after the last step
+    normal = information + prior
     return Solution(z, weights, chi2, cost, decrement, normal, taken, converged, time.perf_counter() - begin, interrupted)

@@ -247,26 +247,22 @@ def described(learned: Learned) -> dict:
                 "high": (value + 1.96 * deviation).tolist(),
             }
         )
-    unit = OUTPUTS[term.place]
-    unit = {"m": "m", "T": "T"}.get(learned.result.recordings[0].unit, "A/m") if unit == "reading" else unit
-    units = [UNITS[v].replace("reading", learned.result.recordings[0].unit) for v in term.variables]
+    reading, terms = learned.result.recordings[0].unit, learned.result.bench.terms
+    unit = reading if OUTPUTS[term.place] == "reading" else terms.unit_of(OUTPUTS[term.place])
+    named = lambda v: terms.word(v).replace(" ", "_")
+    units = [terms.unit_of(UNITS[v]).replace("reading", reading) for v in term.variables]
     axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(low, high, strict=True)), indexing="ij")
     return {
-        "variables": list(term.variables), "variable_units": units, "unit": unit, "share": learned.share,
+        "variables": [named(v) for v in term.variables], "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
         "left_out": list(learned.left_out), "bends_over": learned.place.length,
         "function": {"x": x.tolist(), "slices": slices},
         "boundaries": [
-            {"block": p.block, "variables": list(p.variables), "evidence": p.evidence, "share": p.share, "visibility": p.visibility}
+            {"block": p.block, "variables": [named(v) for v in p.variables], "evidence": p.evidence, "share": p.share, "visibility": p.visibility}
             for p in learned.places
         ],
-        "rivals": [{"block": p.block, "variables": list(p.variables)} for p in learned.rivals],
+        "rivals": [{"block": p.block, "variables": [named(v) for v in p.variables]} for p in learned.rivals],
     }  # fmt: skip
-
-
-def words(name: str) -> str:
-    """A variable's name as people say it."""
-    return name.replace("_", " ")
 
 
 def with_learned_term(found, base, recordings, bench, check=(), progress=None):
@@ -286,7 +282,7 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None):
         )
     more = described(learned)
     start, end, part = region(learned)
-    place, unit = learned.place, more["variable_units"][0]
+    place, unit, words = learned.place, more["variable_units"][0], bench.terms.word
     where = (
         f"all over the range of the {words(place.variables[0])}"
         if part > 0.6

@@ -70,7 +70,7 @@ def _signals(predictor, actuator):
             "current": s.current,
             "field": s.relay_field,
             "coil_field": s.field,
-            "magnetization": s.magnetization,
+            "magnetization": s.magnetization if actuator.piezo is None else s.magnetization - actuator.piezo.chi * s.field,
             "reading": s.reading,
         }
         if s.displacement is not None:
@@ -111,7 +111,7 @@ def null_term(block, variables, signals, actuator, counts) -> LearnedTerm:
     ends = np.array([[signals[v].min(), signals[v].max()] for v in variables])
     knee = np.array([KNEE * np.abs(signals[v]).max() if v.endswith("_rate") else 0.0 for v in variables])
     natural = {"source": np.ptp(signals["current"]), "coil": np.ptp(signals["field"]), "hysteresis": np.ptp(signals["field"])}
-    reach = np.ptp(signals["reading"]) if actuator.magnetostriction is None else float(actuator.magnetostriction.reach)
+    reach = np.ptp(signals["reading"]) if actuator.strained is None else float(actuator.strained.reach)
     size = 1e-3 * natural.get(block, reach)
     return LearnedTerm.null(block, variables, ends[:, 0], ends[:, 1], counts, np.ones(int(np.prod(counts))), size, knee)
 
@@ -236,6 +236,8 @@ def applicable_sets(actuator, signals, quasistatic: bool):
     """Boundaries and variables that this actuator has."""
     for block, variables in SETS:
         if block in ("magnetostriction", "mechanics") and getattr(actuator, block) is None:
+            continue
+        if block == "coil" and actuator.coil.drive == "voltage":
             continue
         if any(v not in signals or np.ptp(signals[v]) == 0 for v in variables):
             continue

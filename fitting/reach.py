@@ -11,4 +11,4 @@ def beyond_text(rows) -> str:
     if not out:
         return ""
     named = ", ".join(f"{name} by {100 * share:.0f} %" for name, share in out)
-    return f"Beyond the range of field that was fitted, where the model is saturated: {named}; fit a recording that reaches as far."
+    return f"Beyond the range that was fitted, where the model is saturated: {named}; fit a recording that reaches as far."

@@ -79,7 +79,7 @@ RATE_FREE = (
 
 
 def applicable(actuator, quasistatic: bool = False):
-    """Effects of the catalogue whose block this actuator has, and that it does not hold already.
+    """Effects of the catalogue that serve this actuator, whose block it has, and that it does not hold already.
 
     `quasistatic`: without a time axis only rate-independent effects can be asked for.
     """
@@ -87,6 +87,8 @@ def applicable(actuator, quasistatic: bool = False):
     found = []
     for effect in CATALOGUE:
         if effect.name in held or (quasistatic and effect.name not in RATE_FREE):
+            continue
+        if not effect.serves(actuator):
             continue
         if effect.block in ("magnetostriction", "mechanics") and getattr(actuator, effect.block) is None:
             continue

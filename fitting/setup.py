@@ -112,20 +112,21 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     low, high = applied_range(spectra, actuator)
     margin = PLANE_MARGIN * (high - low)
     held = masses_held(bench)
-    total = float(actuator.magnetostriction.M_s) if actuator.magnetostriction is not None else _total_from(spectra, bench)
+    total = float(actuator.strained.M_s) if actuator.strained is not None else _total_from(spectra, bench)
+    known_field = bench.drive == "field"
     if held:
         basis = held_basis(actuator.hysteresis, total)
         if low < basis.low or high > basis.high:
             raise ConfigurationError(
-                f"the masses are held on a plane of {basis.low:.5g} .. {basis.high:.5g} A/m and the recordings reach {low:.5g} .. {high:.5g}; "
+                f"the masses are held on a plane of {basis.low:.5g} .. {basis.high:.5g} {bench.terms.unit} and the recordings reach {low:.5g} .. {high:.5g}; "
                 "name hysteresis.masses in fit.free, or leave out the recordings beyond"
             )
     elif choices.knots is None:
         basis = cell_basis(low - margin, high + margin, total, choices.level)
     else:
         crowd = 1.7 if bench.drive == "field" else 1.0
-        level = 2 * choices.level if bench.drive == "field" else choices.level
-        basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive == "field")
+        level = 2 * choices.level if known_field else choices.level
+        basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive != "current")
     zero = float(np.asarray(actuator.coil.applied_field(jnp.asarray(0.0))))
     rest = {"demagnetized": float(np.clip(zero, basis.low, basis.high)), "positive": basis.high}.get(choices.rest, basis.low)
     harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
@@ -136,6 +137,10 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         # field-driven benches differ by decades: find the scale first
         found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
         actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})
+    if "piezo.chi" in names and start is None and not held:
+        steepest = float(actuator.piezo.V_m) * max(s.peak_to_peak for s in spectra) / ((high - low) * _full_scale(actuator))
+        found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "piezo.chi", steepest * np.linspace(0.2, 1.1, 10))
+        actuator = starter = actuator.replace({"piezo.chi": found})
     if held:
         start = np.asarray([(actuator.hysteresis.offset - actuator.hysteresis.masses.sum()) / total])
     elif start is None or len(start) != basis.cells.shape[1] + 1:
@@ -152,7 +157,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
     corners = int(4 * np.ceil(corners / 4))
     # a narrow loop under a strong field turns within a few samples
-    finer = 2 if bench.drive == "field" else 1
+    finer = 2 if known_field else 1
     grids = (finer * choices.coarse, finer * choices.fine)
     predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in grids)
     lines = np.stack([s.reading[: harmonics + 1] for s in spectra])
@@ -184,6 +189,11 @@ def _prior(bench, name, value, is_log, info):
     if info.shape:  # a shape means nothing while its effect is small: hold it within about a factor of three
         return 1.0 if is_log else 0.5
     return NO_PRIOR
+
+
+def _full_scale(actuator) -> float:
+    """The reading of a stack at V_m, SI."""
+    return float(actuator.piezo.P_m if actuator.output == "polarization" else actuator.piezo.stroke)
 
 
 def _total_from(spectra, bench):

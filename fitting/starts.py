@@ -90,18 +90,26 @@ def inferred_loops(spectra, deviations, actuator, samples: int = 200):
             gain = np.asarray(actuator.mechanics.response(w)) if actuator.mechanics is not None else np.ones(count)
             lines = np.where(np.abs(gain) > 0.05, lines / gain, 0.0)
             free = evaluate_lines(lines, phases)
-            scale = float(actuator.magnetostriction.reach)
-            M = float(actuator.magnetostriction.M_s) * unfold(np.sqrt(np.maximum(free, 0.0) / scale), applied)
+            share, M_s = free / float(actuator.strained.reach), float(actuator.strained.M_s)
+            even = actuator.piezo is None  # the strain of a rod hides the sign of M
+            M = M_s * (unfold(np.sqrt(np.maximum(share, 0.0)), applied) if even else share - _reversible(actuator, applied))
             rate = np.gradient(np.concatenate([M[-2:], M, M[:2]]))[2:-2] * samples * s.frequency
             H = applied - float(coil.loss) * MU0 * rate
-            trust = np.abs(M) / max(np.abs(M).max(), 1e-300)
+            trust = np.abs(M) / max(np.abs(M).max(), 1e-300) if even else np.ones(samples)
         else:
             B = evaluate_lines(lines, phases)
             H = applied - float(coil.loss) * evaluate_lines(lines * w, phases)
             M = (B / MU0 - H) if actuator.output == "flux_density" else B
+            if actuator.piezo is not None:
+                M = float(actuator.piezo.V_m) * (B / float(actuator.piezo.P_m) - _reversible(actuator, applied))
             trust = np.ones(samples)
         loops.append((H, M, trust))
     return loops
+
+
+def _reversible(actuator, voltage):
+    """chi V of a stack, as a share of its full scale."""
+    return float(actuator.piezo.chi) / float(actuator.piezo.V_m) * voltage
 
 
 def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ GAUGES = {  # free without a prior beside free masses, and why nothing holds the
     "magnetostriction.lambda_s": "the scale of the masses, with R_eddy, does the same: give it a prior",
     "magnetostriction.M_s": "the scale of the masses, with R_eddy, does the same: give it a prior",
 }
+GAUGES |= dict.fromkeys(("piezo.stroke", "piezo.P_m", "piezo.V_m"), "the masses and chi, scaled, do the same: give it a prior")
 NO_PRIOR = 1e-2  # in the optimiser's coordinate: what keeps a parameter finite
 UNDERSMOOTH = 0.1  # parameters are quoted with a tenth of the roughness weights
 

@@ -277,7 +277,7 @@ def _fall(evidence) -> str:
 def _unknown(evidence, common, note: str = "") -> Diagnosis:
     blocks, fields = evidence.where["by_block"], evidence.where["by_field"]
     block = max(blocks, key=blocks.get) if blocks else "hysteresis"
-    region = f"field quarter {int(np.argmax(fields)) + 1} of 4" if fields else ""
+    region = f"{evidence.bench.terms.field} quarter {int(np.argmax(fields)) + 1} of 4" if fields else ""
     steps = evidence.reached.steps
     best = steps[0][0].name if steps else (common["candidates"][0].name if common["candidates"] else "none")
     text = (

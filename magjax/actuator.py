@@ -1,6 +1,7 @@
 """The actuator: the blocks of the chain and a tuple of effects. It holds physical values in SI.
 
-A bench with fewer blocks leaves later ones out (None): a rod in a coil ends at flux density B = mu0 (H + M).
+A bench with fewer blocks leaves later ones out (None): a rod in a coil ends at flux density B = mu0 (H + M). A piezo stack has
+electrodes for a coil and a piezo for the magnetostriction.
 """
 
 import dataclasses
@@ -9,21 +10,22 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .chain import BLOCKS, Coil, FieldCoil, Magnetostriction, Mechanics, Sensor, Source
+from .chain import BLOCKS, Coil, Electrodes, FieldCoil, Magnetostriction, Mechanics, Piezo, Sensor, Source
 from .effects import SensorLag
 from .effects.base import AbstractEffect
 from .errors import ConfigurationError
 from .param import parameters_of
 from .preisach import Preisach, gaussian_lorentzian_masses
+from .terms import Terms, terms_of
 
 
 class Actuator(eqx.Module):
     """source -> coil <-> hysteresis -> magnetostriction -> mechanics -> sensor, and the effects that act on them.
 
-    `output`: the quantity that the sensor reads: "displacement", "flux_density" or "magnetization".
+    `output`: the quantity that the sensor reads: "displacement", "flux_density", "magnetization" or "polarization".
     """
 
-    coil: Coil | FieldCoil
+    coil: Coil | FieldCoil | Electrodes
     hysteresis: Preisach
     magnetostriction: Magnetostriction | None = None
     mechanics: Mechanics | None = None
@@ -31,6 +33,17 @@ class Actuator(eqx.Module):
     sensor: Sensor = eqx.field(default_factory=Sensor)
     effects: tuple[AbstractEffect, ...] = ()
     output: str = eqx.field(static=True, default="displacement")
+    piezo: Piezo | None = None
+
+    @property
+    def strained(self) -> Magnetostriction | Piezo | None:
+        """The block that makes a free displacement of M, None where there is none."""
+        return self.magnetostriction if self.piezo is None else self.piezo
+
+    @property
+    def terms(self) -> Terms:
+        """The words and units in which this actuator is spoken of."""
+        return terms_of(self.coil.drive)
 
     def with_effect(self, effect: AbstractEffect) -> "Actuator":
         """The same actuator with one more effect; an effect of the same name is replaced.
@@ -40,6 +53,8 @@ class Actuator(eqx.Module):
         """
         from .effects import CATALOGUE
 
+        if not effect.serves(self):
+            raise ConfigurationError(f"{effect.name} acts in a rod or its coil; a stack under voltage has neither: leave it out")
         rank = {c.name: k for k, c in enumerate(CATALOGUE)}
         kept = [e for e in self.effects if e.name != effect.name]
         return dataclasses.replace(self, effects=tuple(sorted((*kept, effect), key=lambda e: rank.get(e.name, len(rank)))))
@@ -63,9 +78,12 @@ class Actuator(eqx.Module):
             if module is None or block == "hysteresis":
                 continue
             for name, info in parameters_of(module).items():
+                if name == ("stroke" if self.output == "polarization" else "P_m"):  # a stack's other full scale
+                    continue
                 found[f"{block}.{name}"] = (getattr(module, name), info)
         for effect in self.effects:
             for name, info in effect.parameters().items():
+                info = dataclasses.replace(info, unit=self.terms.unit_of(info.unit))
                 found[f"effects.{effect.name}.{name}"] = (getattr(effect, name), info)
         return found
 
@@ -90,8 +108,9 @@ class Actuator(eqx.Module):
             for name, (value, info) in self.parameters().items()
         ]
         masses = np.asarray(self.hysteresis.masses)
-        plane = f"  hysteresis: L = {masses.shape[0]}, {float(self.hysteresis.low):.6g}..{float(self.hysteresis.high):.6g} A/m"
-        return "\n".join([f"Actuator, {self.output} out", *lines, f"{plane}, sum of masses {masses.sum():.6g} A/m"])
+        low, high, terms = float(self.hysteresis.low), float(self.hysteresis.high), self.terms
+        plane = f"  hysteresis: L = {masses.shape[0]}, {low:.6g}..{high:.6g} {terms.unit}"
+        return "\n".join([f"Actuator, {self.output} out", *lines, f"{plane}, sum of masses {masses.sum():.6g} {terms.state_unit}"])
 
 
 def _getter(actuator, name: str):
@@ -120,18 +139,28 @@ def from_bench(bench) -> Actuator:
         names = parameters_of(kind)
         return kind(**{n: constants[f"{prefix}.{n}"] for n in names if f"{prefix}.{n}" in constants})
 
-    coil = block(FieldCoil if bench.drive == "field" else Coil, "coil")
+    coil = Electrodes() if bench.drive == "voltage" else block(FieldCoil if bench.drive == "field" else Coil, "coil")
     magnetostriction = block(Magnetostriction, "magnetostriction") if "magnetostriction" in bench.blocks else None
+    piezo = block(Piezo, "piezo") if bench.drive == "voltage" else None
     mechanics = block(Mechanics, "mechanics") if "mechanics" in bench.blocks else None
     low, high = _plane(bench, coil)
     cells = int(bench.levels)
-    M_s = float(magnetostriction.M_s) if magnetostriction is not None else 1e6
+    strained = magnetostriction if piezo is None else piezo
+    M_s = float(strained.M_s) if strained is not None else 1e6
     start = bench.start if bench.start != "auto" else "negative_saturation"
-    masses = tan_baras_density(cells, low, high, 0.5 * M_s)
-    hysteresis = Preisach(masses, low, high, 0.5 * M_s, start)
+    switched = 0.5 * M_s if piezo is None else 0.1 * M_s
+    masses = tan_baras_density(cells, low, high, switched)
+    hysteresis = Preisach(masses, low, high, switched, start)
     known = (SensorLag(constants["sensor.tau"], constants.get("sensor.order2", 0.0)),) if "sensor.tau" in constants else ()
     return Actuator(
-        coil, hysteresis, magnetostriction, mechanics, sensor=block(Sensor, "sensor"), effects=known, output=bench.output
+        coil,
+        hysteresis,
+        magnetostriction,
+        mechanics,
+        sensor=block(Sensor, "sensor"),
+        effects=known,
+        output=bench.output,
+        piezo=piezo,
     )
 
 
@@ -139,7 +168,7 @@ def _check_bench(bench):
     """What a bench file alone does not tell: whether there is a coil to drive, and which effects its priors speak of."""
     from .effects import CATALOGUE
 
-    if not any(name.startswith("coil.") for name in bench.constants):
+    if bench.drive != "voltage" and not any(name.startswith("coil.") for name in bench.constants):
         raise ConfigurationError(
             f"bench {bench.source or bench.name}: has no [coil], so nothing to drive; state one (see docs/parameters.md)"
         )
@@ -152,9 +181,8 @@ def _check_bench(bench):
 
 
 def _plane(bench, coil):
-    """Range of the Preisach plane, A/m: what the current (field) limit reaches on either side of the bias."""
-    key, usual = ("current_A", 0.9) if bench.drive == "current" else ("field_A_per_m", 300.0)
-    largest = float(bench.limits.get(key, usual))
+    """Range of the Preisach plane, A/m (V): what the limit of the drive reaches on either side of the bias."""
+    largest = float(bench.limit or {"current": 0.9, "field": 300.0, "voltage": 150.0}[bench.drive])
     ends = [float(coil.applied_field(jnp.asarray(sign * largest))) for sign in (-1, 1)]
     margin = 0.01 * (ends[1] - ends[0])
     return ends[0] - margin, ends[1] + margin

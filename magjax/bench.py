@@ -1,7 +1,8 @@
 """The bench file (TOML): constants, which blocks there are, which column is which quantity, what is free.
 
 A bench with [magnetostriction] and [mechanics] ends at displacement and is driven by current; one whose [coil] holds
-k_eddy is driven by a known field and ends at flux density. With output = "strain" a table of strain curves is read, no recording.
+k_eddy is driven by a known field and ends at flux density; one with [piezo] is driven by a voltage and ends at displacement
+or polarization. With output = "strain" a table of strain curves is read, no recording.
 """
 
 import dataclasses
@@ -11,17 +12,19 @@ import tomllib
 from pathlib import Path
 
 from .errors import ConfigurationError
+from .terms import LIMITS, Terms, terms_of
 
 BLOCK_KEYS = {
     "coil": ("R_eddy", "c0", "H_bias", "N_m", "A_m", "k_eddy"),
     "magnetostriction": ("lambda_s", "M_s", "l_rod"),
+    "piezo": ("stroke", "P_m", "V_m", "chi"),
     "mechanics": ("f0", "xi"),
     "sensor": ("offset", "tau", "order2"),
 }
 KNOWN_TO = 1e-3  # relative; how well a filter of the sensor that is stated is taken to be known
 OTHER_KEYS = {
     "hysteresis": ("levels", "start"),
-    "limits": ("current_A", "field_A_per_m"),
+    "limits": tuple(LIMITS.values()),
     "fit": ("free", "output", "priors"),
 }
 NEEDED = {  # what a block should state: else T&B's constant is taken for this bench's, which is told
@@ -30,7 +33,7 @@ NEEDED = {  # what a block should state: else T&B's constant is taken for this b
     "mechanics": BLOCK_KEYS["mechanics"],
 }
 SIGNED = ("H_bias", "offset")
-MAY_BE_ZERO = (*SIGNED, "k_eddy", "xi", "order2")
+MAY_BE_ZERO = (*SIGNED, "k_eddy", "xi", "order2", "chi")
 COLUMN_KEYS = {  # key -> what it must be
     "name": str,
     "scale": float,
@@ -55,12 +58,13 @@ QUANTITIES = (
     "reference",
     "flux_density",
     "magnetization",
+    "polarization",
     "voltage",
     "temperature",
     "strain",
     "stress",
 )
-OUTPUTS = ("displacement", "flux_density", "magnetization", "strain")
+OUTPUTS = ("displacement", "flux_density", "magnetization", "polarization", "strain")
 STARTS = ("auto", "demagnetized", "negative_saturation", "positive_saturation")
 
 
@@ -86,9 +90,19 @@ class Bench:
     def assumed(self) -> tuple[str, ...]:
         """Constants that the file does not state: those of T&B Sec. 2.3 (`aa-050h`) stand in for them."""
         needed = [f"{block}.{key}" for block, keys in NEEDED.items() if block in self.blocks for key in keys]
-        if self.drive == "field":
+        if self.drive != "current":
             needed = [name for name in needed if not name.startswith("coil.")]
         return () if self.output == "strain" else tuple(name for name in needed if name not in self.constants)
+
+    @property
+    def terms(self) -> Terms:
+        """The words and units in which this bench is spoken of."""
+        return terms_of(self.drive)
+
+    @property
+    def limit(self) -> float | None:
+        """Largest drive that [limits] states, SI."""
+        return self.limits.get(LIMITS[self.drive])
 
     def actuator(self):
         """The actuator with these constants and a starting density (imports JAX)."""
@@ -181,11 +195,29 @@ def _check_blocks(content, path):
         raise ConfigurationError(
             f"bench {path}: coil.R_eddy does nothing beside coil.k_eddy, which says that the drive is a known field; take one away"
         )
-    if "mechanics" in content and "magnetostriction" not in content:
+    if "piezo" in content:
+        _check_piezo(content, path)
+    elif "mechanics" in content and "magnetostriction" not in content:
         raise ConfigurationError(f"bench {path}: [mechanics] without [magnetostriction], which drives it; add that block")
     sensor = content.get("sensor", {})
     if "order2" in sensor and "tau" not in sensor:
         raise ConfigurationError(f"bench {path}: sensor.order2 without sensor.tau; state the filter's tau in s beside it")
+
+
+def _check_piezo(content, path):
+    """A stack under voltage has no coil, and its data sheet's stroke where a displacement is read."""
+    for block in ("coil", "magnetostriction"):
+        if block in content:
+            raise ConfigurationError(f"bench {path}: [{block}] beside [piezo], which is driven by a voltage; take one away")
+    charge = content.get("fit", {}).get("output") == "polarization"
+    scale, what = ("P_m", "largest polarization P_m (C/m^2)") if charge else ("stroke", "data sheet's stroke (m)")
+    missing = [k for k in (scale, "V_m") if k not in content["piezo"]]
+    if missing:
+        raise ConfigurationError(
+            f"bench {path}: [piezo] does not state {' and '.join(missing)}; write the {what} and the voltage V_m (V) it belongs to"
+        )
+    if charge and "mechanics" in content:
+        raise ConfigurationError(f'bench {path}: [mechanics] moves nothing where fit.output = "polarization"; take it away')
 
 
 def _columns(content, path) -> dict:
@@ -221,8 +253,9 @@ def _limits(content, path, drive) -> dict:
     limits = content.get("limits", {})
     for key, value in limits.items():
         _positive(value, f"limits.{key}", path)
-    if drive == "current" and "field_A_per_m" in limits and "current_A" not in limits:
-        raise ConfigurationError(f"bench {path}: limits.field_A_per_m bounds a bench driven by a field; give limits.current_A")
+    for other, key in LIMITS.items():
+        if key in limits and other != drive and LIMITS[drive] not in limits:
+            raise ConfigurationError(f"bench {path}: limits.{key} bounds a bench driven by a {other}; give limits.{LIMITS[drive]}")
     return limits
 
 
@@ -241,7 +274,7 @@ def _start(content, path):
 def _fit(content, path, present, drive):
     """(free, output, priors) of [fit]."""
     fit = content.get("fit", {})
-    lag = "coil.k_eddy" if drive == "field" else "coil.R_eddy"
+    lag = {"field": "coil.k_eddy", "current": "coil.R_eddy", "voltage": "piezo.chi"}[drive]
     free = fit.get("free", ["hysteresis.masses", lag, *(("mechanics.xi", "mechanics.f0") if "mechanics" in present else ())])
     if not isinstance(free, list):
         written = f'["{free}"]' if isinstance(free, str) else '["coil.R_eddy"]'
@@ -250,10 +283,17 @@ def _fit(content, path, present, drive):
     for name in free:
         if name not in known:
             raise ConfigurationError(f'bench {path}: fit.free names "{name}"{_suggest(str(name), known)}')
-    output = fit.get("output", "displacement" if "magnetostriction" in present else "flux_density")
+    moves = "magnetostriction" in present or drive == "voltage"
+    output = fit.get("output", "displacement" if moves else "flux_density")
     if output not in OUTPUTS:
         raise ConfigurationError(f"bench {path}: fit.output = {output!r} is unknown{_suggest(str(output), OUTPUTS)}")
-    if output == "displacement" and "magnetostriction" not in present:
+    if drive == "voltage" and output not in ("displacement", "polarization"):
+        raise ConfigurationError(
+            f'bench {path}: fit.output = "{output}" is not read of a stack under voltage; write "displacement" or "polarization"'
+        )
+    if output == "polarization" and drive != "voltage":
+        raise ConfigurationError(f'bench {path}: fit.output = "polarization" needs [piezo]; write "magnetization" for a rod')
+    if output == "displacement" and not moves:
         raise ConfigurationError(
             f'bench {path}: fit.output = "displacement" needs [magnetostriction]; add it or write "flux_density"'
         )
@@ -289,10 +329,10 @@ def _build(content, path) -> Bench:
     if not isinstance(name, str):
         raise ConfigurationError(f'bench {path}: name = {name!r} must be text; write name = "{name}"')
     constants = _constants(content, path)
-    drive = "field" if "coil.k_eddy" in constants else "current"
+    drive = "voltage" if "piezo" in content else "field" if "coil.k_eddy" in constants else "current"
     present = tuple(
-        b for b in ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sensor")
-        if b in ("source", "coil", "hysteresis", "sensor") or b in content
+        b for b in ("source", "coil", "hysteresis", "magnetostriction", "piezo", "mechanics", "sensor")
+        if b in ("source", "hysteresis", "sensor") or b in content or (b == "coil" and drive != "voltage")
     )  # fmt: skip
     free, output, priors = _fit(content, path, present, drive)
     levels = content.get("hysteresis", {}).get("levels", 25)

@@ -7,6 +7,7 @@ import numpy as np
 from .clipping import quantum
 from .errors import RecordingError
 from .plausibility import STRONG_FIELD
+from .terms import DRIVE_UNITS
 
 MOST_FILLED = 0.05  # of the samples: more is no measurement
 
@@ -87,13 +88,13 @@ def inspect(recording, bench) -> Card:
                 "less than two periods: a fit can only guess the noise from the high orders, and its errors with it; record three or more"
             )
     H = _applied(bench, x)
-    facts["visited plane"] = f"applied field {H.min():.5g} .. {H.max():.5g} A/m"
+    terms = bench.terms
+    facts["visited plane"] = f"{terms.applied} {H.min():.5g} .. {H.max():.5g} {terms.unit}"
     whole = _plane(bench)
     if whole is not None:
         share = min((H.max() - H.min()) / (whole[1] - whole[0]), 1.0) ** 2
         facts["visited plane"] += f", {share:.0%} of the relays that the bench's limits reach"
-    limit = bench.limits.get("current_A" if bench.drive == "current" else "field_A_per_m")
-    peak, unit = float(np.abs(x).max()), {"current": "A", "field": "A/m"}.get(bench.drive, "")
+    limit, peak, unit = bench.limit, float(np.abs(x).max()), DRIVE_UNITS[bench.drive]
     if limit and peak > 1.02 * limit:
         warnings.append(
             f"the drive reaches {peak:.4g} {unit}, the bench's limit is {limit:g} {unit}; check the column's unit, or widen [limits] if that is meant"
@@ -123,17 +124,16 @@ def _judge_gaps(recording, facts, problems, warnings):
 
 
 def _applied(bench, x):
-    if bench.drive == "field":
+    if bench.drive != "current":
         return x
     return bench.constants.get("coil.c0", 1.0) * x + bench.constants.get("coil.H_bias", 0.0)
 
 
 def _plane(bench):
-    """The range of applied field that the bench's limits reach, A/m, or None where none are stated."""
-    limit = bench.limits.get("current_A" if bench.drive == "current" else "field_A_per_m")
-    if not limit:
+    """The range of applied field (voltage) that the bench's limits reach, A/m (V), or None where none are stated."""
+    if not bench.limit:
         return None
-    ends = _applied(bench, np.array([-limit, limit]))
+    ends = _applied(bench, np.array([-bench.limit, bench.limit]))
     return float(ends[0]), float(ends[1])
 
 

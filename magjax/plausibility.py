@@ -13,14 +13,18 @@ UNITS = {
     "reference": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
     "flux_density": {"T": 1.0, "mT": 1e-3, "G": 1e-4},
     "magnetization": {"A/m": 1.0, "A_per_m": 1.0, "kA/m": 1e3, "kA_per_m": 1e3},
-    "voltage": {"V": 1.0, "mV": 1e-3},
+    "polarization": {"C/m^2": 1.0, "C_per_m2": 1.0, "C_per_m^2": 1.0, "uC/cm^2": 1e-2, "uC_per_cm2": 1e-2},
+    "voltage": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
     "temperature": {"degC": 1.0, "K": 1.0},
     "strain": {"1": 1.0, "ppm": 1e-6},
     "stress": {"Pa": 1.0, "MPa": 1e6},
 }
 ZERO = {("temperature", "K"): -273.15}  # added after the factor
 # quantity -> (largest absolute value that a bench of this kind gives, a usual one), SI
-SENSIBLE = {"current": (60.0, 1.0), "displacement": (5e-3, 3e-5), "flux_density": (4.0, 1.0), "field": (5e6, 1e4)}
+SENSIBLE = {
+    "current": (60.0, 1.0), "displacement": (5e-3, 3e-5), "flux_density": (4.0, 1.0), "field": (5e6, 1e4), "voltage": (2e4, 100.0),
+    "polarization": (3.0, 0.3),
+}  # fmt: skip
 STRONG_FIELD = 3e5  # A/m: several times what saturates a Terfenol-D rod
 
 
@@ -44,11 +48,12 @@ def check_sizes(name: str, channels: dict, units: dict, bench):
             return f"check the column and the scale in [columns.{quantity}]"
         return f'if the column is in {best}, name it {quantity}_{best} or write unit = "{best}" in [columns.{quantity}]'
 
-    limit = bench.limits.get("current_A")
+    drive, limit = bench.drive, bench.limit if bench.drive != "field" else None
     reach = bench.constants.get("magnetostriction.lambda_s", 0) * bench.constants.get("magnetostriction.l_rod", 0)
+    reach = reach or bench.constants.get("piezo.stroke", 0)
     usual = (
         {q: v for q, (_, v) in SENSIBLE.items()}
-        | ({"current": limit} if limit else {})
+        | ({drive: limit} if limit else {})
         | ({"displacement": reach / 3} if reach else {})
     )
     for quantity, (largest, _) in SENSIBLE.items():
@@ -58,16 +63,17 @@ def check_sizes(name: str, channels: dict, units: dict, bench):
                 f"{name}: {quantity} reaches {peak:.4g} {si_unit(quantity)}, more than any such bench gives; "
                 f"{mend(quantity, peak, usual[quantity])}"
             )
-    if limit and "current" in channels:
-        peak = float(np.nanmax(np.abs(channels["current"])))
+    if limit and drive in channels:
+        peak, unit = float(np.nanmax(np.abs(channels[drive]))), si_unit(drive)
         if peak > 20 * limit:
             raise RecordingError(
-                f"{name}: the current reaches {peak:.4g} A where the bench allows {limit:g} A; {mend('current', peak, limit)}"
+                f"{name}: the {drive} reaches {peak:.4g} {unit} where the bench allows {limit:g} {unit}; {mend(drive, peak, limit)}"
             )
     if reach and "displacement" in channels:
+        what, at = ("stack", "V_m") if drive == "voltage" else ("rod", "saturation")
         stroke = float(np.nanmax(channels["displacement"]) - np.nanmin(channels["displacement"]))
         if stroke > 30 * reach or 0 < stroke < 1e-5 * reach:
             raise RecordingError(
-                f"{name}: a stroke of {stroke:.4g} m where the rod gives {reach:.3g} m at saturation; "
+                f"{name}: a stroke of {stroke:.4g} m where the {what} gives {reach:.3g} m at {at}; "
                 f"{mend('displacement', stroke, usual['displacement'])}"
             )

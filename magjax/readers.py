@@ -188,6 +188,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         "voltage",
         "temperature",
         "magnetization",
+        "polarization",
         "flux_density",
         "displacement",
         "current",
@@ -242,7 +243,7 @@ def _find(path, table, quantity, column, required):
             raise RecordingError(f"{path}: no column {column['name']}; the file has {', '.join(table)} (see [columns.{quantity}])")
         usual = {
             "current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm", "time": "time_s",
-            "reference": "reference_m",
+            "reference": "reference_m", "voltage": "voltage_V", "polarization": "polarization_C_per_m2",
         }.get(quantity, "flux_density_T")  # fmt: skip
         raise RecordingError(
             f"{path}: no {quantity} column among {', '.join(table)}; name it {usual} or map it in [columns.{quantity}] of the bench"

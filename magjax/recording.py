@@ -75,8 +75,8 @@ class Recording:
 
     @property
     def drive(self) -> str:
-        """Name of the driving channel: "current" or "field"; of a sensor's calibration "reference", the known displacement."""
-        return next((c for c in ("current", "reference") if c in self.channels), "field")
+        """Name of the driving channel: "current", "field" or "voltage"; of a sensor's calibration "reference", the known displacement."""
+        return next((c for c in ("current", "reference", "field", "voltage") if c in self.channels), "field")
 
     def frequency(self) -> float | None:
         """Fundamental of the drive, Hz; None where less than 0.9 of a period is recorded or nothing repeats."""

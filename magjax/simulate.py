@@ -1,6 +1,6 @@
 """simulate(actuator, current, dt): the whole chain for one drive; sweep: a grid of frequencies, amplitudes and offsets.
 
-Current (A) or applied field (A/m) in, every signal of the chain out, SI. Periodic drives end in their steady state, which is
+Current (A), applied field (A/m) or voltage (V) in, every signal of the chain out, SI. Periodic drives end in their steady state, which is
 judged: a small loop, or one at a high frequency, settles over tens of periods where a large slow one takes two.
 """
 
@@ -22,7 +22,8 @@ from .scale.devices import over_devices
 
 
 class Signals(eqx.Module):
-    """Every signal of the chain over time, SI; `residual` is that of the implicit step, A/m.
+    """Every signal of the chain over time, SI; `residual` is that of the implicit step, A/m. Of a stack under voltage `field` is
+    the voltage and `magnetization` the polarization (see `magjax.terms`); its `flux_density` means nothing.
 
     `unsettled`: of a steady state, how much the last two periods differ, relative to the peak to peak of H + M; else 0.
     """
@@ -99,10 +100,12 @@ def march_chain(actuator, line, current, periods: int, corners: int, scheme: str
 def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, unsettled=0.0) -> Signals:
     """The blocks after the hysteresis: magnetostriction, mechanics, sensor, with their effects."""
     B = MU0 * (H + M)
+    if actuator.piezo is not None:
+        M = actuator.piezo.polarization(M, H)
     signals = {"command": command, "current": current, "field": H, "magnetization": M, "flux_density": B}
     free = displacement = None
-    if actuator.magnetostriction is not None:
-        free = actuator.magnetostriction(M)
+    if actuator.strained is not None and actuator.output != "polarization":
+        free = actuator.strained(M)
         for effect in actuator.effects:
             free = effect.strain(free, M, H, line, actuator)
         displacement = free
@@ -110,7 +113,8 @@ def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, 
         displacement = actuator.mechanics(free, line)
         for effect in actuator.effects:
             displacement = effect.displacement(displacement, free, signals, line, actuator)
-    quantity = {"displacement": displacement, **signals}[actuator.output]
+    charge = actuator.piezo.surface_charge(M) if actuator.output == "polarization" else None
+    quantity = {"displacement": displacement, "polarization": charge, **signals}[actuator.output]
     if quantity is None:
         raise ConfigurationError(
             f"the bench reads {actuator.output} but has no magnetostriction; add the block or read flux_density"
@@ -138,7 +142,7 @@ def simulate(
 ) -> Signals:
     """Simulate the actuator.
 
-    `current`: (time,), A (applied field, A/m, on a field-driven bench). `dt`: s. `periodic`: the samples are one period
+    `current`: (time,), A (applied field, A/m, or voltage, V, where that drives the bench). `dt`: s. `periodic`: the samples are one period
     (or several whole ones) of a steady drive, repeated until two repetitions differ by less than `tolerance` of the peak to
     peak of H + M (`MOST_PERIODS` at most: `unsettled` of the result tells what is left), or exactly `settle` times before
     the one that is returned. `corners`: room for the memory, found from the drive if None.
@@ -188,9 +192,10 @@ def _refuse_outside(actuator, lowest, highest, where=""):
     low, high = float(actuator.hysteresis.low), float(actuator.hysteresis.high)
     width = high - low
     if lowest < low - 0.02 * width or highest > high + 0.02 * width:
+        terms = actuator.terms
         raise ConfigurationError(
-            f"the drive{where} leads the field to {lowest:.5g}..{highest:.5g} A/m, outside the Preisach plane "
-            f"{low:.5g}..{high:.5g} A/m; lower the drive or widen the plane (limits in the bench file)"
+            f"the drive{where} leads the {terms.field} to {lowest:.5g}..{highest:.5g} {terms.unit}, outside the Preisach plane "
+            f"{low:.5g}..{high:.5g} {terms.unit}; lower the drive or widen the plane (limits in the bench file)"
         )
 
 
@@ -202,7 +207,7 @@ def sweep(
 
     `frequencies` Hz, `amplitudes` and `offsets` in the unit of the drive; `settle` and `tolerance` as in `simulate`
     (where a small loop creeps, three to four times the tolerance may be left). Returns
-    peak-to-peak and mean reading, amplitude and phase of its fundamental, loss per cycle, and `unsettled`, how much the last
+    peak-to-peak and mean reading, amplitude and phase of its fundamental, loss per cycle (not of a stack under voltage), and `unsettled`, how much the last
     two periods differ; `keep=True` adds the waveforms. The grid is run in chunks of `chunk` trajectories, so memory does not
     grow with it, each over the devices that JAX sees; `executor`, `checkpoint` and `progress` as in `magjax.scale.run_job`:
     the numbers are the same to the last bit for any of them. Raises `ConfigurationError` for a frequency that is not above
@@ -255,7 +260,8 @@ def sweep(
     for name in ("peak_to_peak", "mean", "fundamental"):
         result[name].attrs["units"] = unit
     result["lag"].attrs["units"] = "rad"
-    result["loss"].attrs["units"] = "J/m^3"
+    if "loss" in result:
+        result["loss"].attrs["units"] = "J/m^3"
     result["frequency"].attrs["units"] = "Hz"
     result["unsettled"].attrs["units"] = "1"
     return result
@@ -305,7 +311,9 @@ def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, until
             "highest": jnp.max(signals.relay_field),
             "overflow": signals.overflow,
         }
-        return {**results, "reading": y, "field": signals.field} if keep else results
+        if actuator.coil.drive == "voltage":  # its energy takes the charge, which is not in the model
+            del results["loss"]
+        return {**results, "reading": y, actuator.terms.field: signals.field} if keep else results
 
     count = len(frequency)
     width = min(count, BATCH) if jax.default_backend() == "cpu" else count
@@ -316,7 +324,7 @@ def _sweep_chunk(actuator, frequency, amplitude, offset, samples, periods, until
 
 UNITS = {
     "current": "A", "field": "A/m", "magnetization": "A/m", "flux_density": "T", "free_displacement": "m", "displacement": "m",
-    "relay_field": "A/m",
+    "relay_field": "A/m", "voltage": "V", "polarization": "C/m^2",
 }  # fmt: skip
 
 
@@ -325,8 +333,13 @@ def signals_dataset(signals: Signals, actuator, bench: str = ""):
     import xarray as xr
 
     time = np.asarray(signals.time)
-    drive = UNITS[actuator.coil.drive]
+    drive, terms = UNITS[actuator.coil.drive], actuator.terms
     units = {"command": drive, **UNITS, "current": drive, "reading": UNITS[actuator.output]}
-    values = {n: np.asarray(getattr(signals, n)) for n in units if getattr(signals, n) is not None}
-    data = {n: ("time", v, {"units": units[n]}) for n, v in values.items()}
+    names = {}
+    if actuator.coil.drive == "voltage":  # applied and seen by the relays are one
+        names = {"field": "voltage", "magnetization": "polarization"}
+        units = {n: u for n, u in units.items() if n not in ("current", "flux_density", "relay_field")}
+        units |= {"field": terms.unit, "magnetization": terms.state_unit}
+    values = {n: np.asarray(getattr(signals, n)) for n in units if getattr(signals, n, None) is not None}
+    data = {names.get(n, n): ("time", v, {"units": units[n]}) for n, v in values.items()}
     return xr.Dataset(data, coords={"time": ("time", time, {"units": "s"})}, attrs={"bench": bench, "output": actuator.output})

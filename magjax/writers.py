@@ -8,11 +8,12 @@ from .errors import ConfigurationError
 
 NAMES = {
     "current": "current_A", "command": "command_A", "field": "field_A_per_m", "displacement": "displacement_m", "reference": "reference_m",
-    "flux_density": "flux_density_T", "magnetization": "magnetization_A_per_m", "voltage": "voltage_V", "temperature": "temperature_degC",
+    "flux_density": "flux_density_T", "magnetization": "magnetization_A_per_m", "polarization": "polarization_C_per_m2",
+    "voltage": "voltage_V", "temperature": "temperature_degC",
 }  # fmt: skip
 UNITS = {
     "current": "A", "command": "A", "field": "A/m", "displacement": "m", "reference": "m", "flux_density": "T", "magnetization": "A/m",
-    "voltage": "V", "temperature": "degC",
+    "polarization": "C/m^2", "voltage": "V", "temperature": "degC",
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from . import found as pictures
 from . import learned, loops, misfit, plane, tables
 from .fit_page import AT_NOISE, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
-from .style import percent, plain, scale_of, unit_text
+from .style import percent, plain, scale_of, terms_in, unit_text
 
 TONES = {
     "nothing_missing": "good",
@@ -39,7 +39,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         section("Next experiment", *_next(found, names)),
         section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"))),
         _checks(found, evidence, sketch, output, drive),
-        _where(found, facts, base, sketch, output),
+        _where(found, facts, base, sketch, output, drive),
         _ranking(found, facts, sketch),
         _loops(found, base, repaired, sketch, output, drive),
         _left(found, base, repaired, sketch, output),
@@ -224,7 +224,7 @@ def _loops(found, base, repaired, sketch, output, drive):
     return section(title, sketch(base, loops.loops, base, output, drive, repaired or None, added(found)))
 
 
-def _where(found, facts, base, sketch, output):
+def _where(found, facts, base, sketch, output, drive):
     where = found["where"]
     if not where or not base:
         return None
@@ -233,9 +233,11 @@ def _where(found, facts, base, sketch, output):
     marks |= {found["unknown"]["block"]: "acts most like this"} if found["unknown"] else {}
     return section(
         "Where simulation and recordings differ",
-        sketch(where.get("by_block"), pictures.block_map, where, marks, output),
+        sketch(where.get("by_block"), pictures.block_map, where, marks, drive),
         *headed("Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base)),
-        *headed("By branch, field and period", sketch(where.get("by_branch"), pictures.places, where, base, output)),
+        *headed(
+            f"By branch, {terms_in(base).field} and period", sketch(where.get("by_branch"), pictures.places, where, base, output)
+        ),
     )
 
 
@@ -308,7 +310,9 @@ def _left(found, base, repaired, sketch, output):
             "By frequency and harmonic",
             sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise"),
         ),
-        *headed("Against field, rate and frequency", sketch(repaired, misfit.against, repaired, "against-after")),
+        *headed(
+            f"Against {terms_in(repaired).field}, rate and frequency", sketch(repaired, misfit.against, repaired, "against-after")
+        ),
         *headed("Autocorrelation", sketch(repaired, misfit.autocorrelation, repaired, "autocorrelation-after")),
         *headed("Spectrum", sketch(repaired, misfit.spectrum, repaired, output, "spectrum-after")),
     )

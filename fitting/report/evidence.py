@@ -33,6 +33,7 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
     noise = np.array([max(s.noise_rms, 1e-300) for s in spectra])
     scaled = [r / n for r, n in zip(residuals, noise, strict=True)]
     found = {
+        "drive": result.bench.drive,
         "name": np.array([_short(r.file) for r in result.recordings]),
         "frequency": np.array([s.frequency for s in spectra]),
         "periods": np.array([s.periods for s in spectra]),
@@ -207,7 +208,7 @@ def of_checks(before, after, recordings, bench) -> dict:
     return found
 
 
-READINGS = ("displacement", "flux_density", "magnetization")
+READINGS = ("displacement", "flux_density", "magnetization", "polarization")
 
 
 def of_recordings(recordings) -> dict:

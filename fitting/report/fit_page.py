@@ -5,7 +5,7 @@ import re
 
 from . import loops, misfit, plane, tables
 from .page import Sketch, part, section
-from .style import plain
+from .style import plain, terms_in
 
 NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
 BELOW_NOISE, AT_NOISE, FAR = 0.5, 1.1, 2.0  # chi2/N: noise overstated; the error bars hold; they mean nothing
@@ -117,7 +117,7 @@ def residual_section(sketch, evidence, output, title: str = "What the fit leaves
         title,
         *headed("By frequency and harmonic", sketch(evidence if with_map else None, misfit.misfit_map, evidence)),
         *headed("Along time", sketch(evidence, misfit.traces, evidence)),
-        *headed("Against field, rate and frequency", sketch(evidence, misfit.against, evidence)),
+        *headed(f"Against {terms_in(evidence).field}, rate and frequency", sketch(evidence, misfit.against, evidence)),
         *headed("Autocorrelation", sketch(evidence, misfit.autocorrelation, evidence)),
         *headed("Spectrum", sketch(evidence, misfit.spectrum, evidence, output)),
     )
@@ -147,6 +147,6 @@ def sentence(text: str) -> str:
 def _quantities(fit, evidence):
     """(output, drive) of the recordings."""
     unit = fit["recordings"][0]["unit"] if fit["recordings"] else "m"
-    drive = "current" if "current" in str(evidence.get("drive", "current")) else "field"
+    drive = str(evidence.get("drive", "current"))
     channel = fit["recordings"][0]["channel"] if fit["recordings"] else "displacement"
     return channel if channel in tables.CHANNEL_OF.values() else tables.CHANNEL_OF.get(unit, "displacement"), drive

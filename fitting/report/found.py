@@ -9,7 +9,7 @@ BLOCKS = ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sens
 THRESHOLD = 5.5  # of |z|, as the search uses it
 
 
-def block_map(where, marks, output: str, stem: str = "blocks"):
+def block_map(where, marks, drive: str, stem: str = "blocks"):
     """The chain of blocks, each shaded by the share of the misfit that its best effect could explain; `marks`: block ->
     what the verdict says of it."""
     shares = where["by_block"]
@@ -36,9 +36,8 @@ def block_map(where, marks, output: str, stem: str = "blocks"):
                     xytext=(left + wide - 0.03, 0.5),
                     arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1},
                 )
-        ends = "field" if output == "flux_density" else "current"
         caption = (
-            f"The chain from {ends} to reading. The percentage is the share of the misfit that the best single effect of the block could take, to first "
+            f"The chain from {drive} to reading. The percentage is the share of the misfit that the best single effect of the block could take, to first "
             "order; blocks overlap, so shares do not add up. A thick frame marks the blocks of which the verdict speaks."
         )
         words = ", ".join(f"{b} {percent(shares.get(b, 0.0))}" + (f" ({marks[b]})" if b in marks else "") for b in shown)

@@ -2,7 +2,25 @@
 
 import numpy as np
 
-from .style import BLUE, INK, MEASURED, MODEL, MUTED, PALE, SKY, VERMILION, canvas, drive_label, picture, plain, scale_of, styled
+from magjax.terms import terms_of
+
+from .style import (
+    BLUE,
+    INK,
+    MEASURED,
+    MODEL,
+    MUTED,
+    PALE,
+    SKY,
+    VERMILION,
+    canvas,
+    drive_label,
+    per,
+    picture,
+    plain,
+    scale_of,
+    styled,
+)
 
 COLUMNS = 3
 WIDTH = 10.0  # inches
@@ -166,7 +184,8 @@ def inside(evidence, drive: str, stem: str = "inside"):
     """H, I_1 and M over a period, and M against H, of a few recordings."""
     keys = list(evidence["inside"])
     with_current = "I_1" in evidence["inside"][keys[0]]
-    rows = ["H", "I_1", "M", "loop"] if with_current else ["H", "M", "loop"]
+    terms = terms_of(drive)
+    rows = ["H", "I_1", "M", "loop"] if with_current else ["M", "loop"] if drive == "voltage" else ["H", "M", "loop"]
     heights = {"H": 1.25, "I_1": 1.25, "M": 1.25, "loop": 2.2}
     gap, top, bottom = 0.42, 0.32, 0.3
     total = sum(heights[r] for r in rows) + gap * (len(rows) - 1) + top + bottom + 0.25
@@ -177,26 +196,26 @@ def inside(evidence, drive: str, stem: str = "inside"):
             for row in rows:
                 y -= heights[row]
                 axes = figure.add_axes([(c + 0.2) / 3, y / total, 0.76 / 3, heights[row] / total])
-                _inside_row(axes, row, signals, drive, c == 0)
+                _inside_row(axes, row, signals, terms, c == 0)
                 if row == "H":
                     axes.set_title(f"{evidence['name'][int(key)]}, {plain(evidence['frequency'][int(key)])} Hz", loc="left")
                 y -= gap if row != "M" else 0.55
         words = (
             "the current I that is applied and I₁ = (H − H_bias)/c₀, which is left of it for the field; " if with_current else ""
         )
+        which = "the field that is applied and the field H in the rod; " + words if "H" in rows else ""
         caption = (
-            f"Signals that no instrument reads, as the fitted model has them: the field that is applied and the field H in the rod; {words}"
-            "the magnetization M; and M against H."
+            f"Signals that no instrument reads, as the fitted model has them: {which}"
+            f"the {terms.state} {terms.state_letter}; and {terms.state_letter} against {terms.field_letter}."
         )
-        return picture(
-            figure, stem, "Signals inside the model: H, I₁ and M" if with_current else "Signals inside the model: H and M", caption
-        )
+        shown = "H, I₁ and M" if with_current else "H and M" if "H" in rows else terms.state_letter
+        return picture(figure, stem, f"Signals inside the model: {shown}", caption)
 
 
-def _inside_row(axes, row, signals, drive, first):
+def _inside_row(axes, row, signals, terms, first):
     phase = signals["phase"]
-    scale, unit = (1e-3, "kA/m") if np.abs(signals["H"]).max() > 2e3 else (1.0, "A/m")
-    magnet, magnet_unit = (1e-3, "kA/m") if np.abs(signals["M"]).max() > 2e3 else (1.0, "A/m")
+    scale, unit = terms.scaled(np.abs(signals["H"]).max())
+    magnet, magnet_unit = terms.scaled(np.abs(signals["M"]).max(), state=True)
     if row == "H":
         axes.plot(phase, scale * signals["applied"], color=SKY, lw=2.6, alpha=0.8, label="applied")
         axes.plot(phase, scale * signals["H"], color=INK, lw=0.9, label="H")
@@ -207,12 +226,12 @@ def _inside_row(axes, row, signals, drive, first):
         label = "current / A"
     elif row == "M":
         axes.plot(phase, magnet * signals["M"], color=BLUE, lw=1.2)
-        label = f"M / ({magnet_unit})"
+        label = f"{terms.state_letter} / {per(magnet_unit)}"
     else:
         close = lambda x: np.append(x, x[0])
         axes.plot(scale * close(signals["H"]), magnet * close(signals["M"]), color=BLUE, lw=1.2)
-        label = f"M / ({magnet_unit})"
-        axes.set_xlabel(f"H / ({unit})")
+        label = f"{terms.state_letter} / {per(magnet_unit)}"
+        axes.set_xlabel(f"{terms.field_letter} / {per(unit)}")
     if row in ("H", "I_1") and first:
         axes.legend(loc="best", handlelength=1.2, borderaxespad=0)
     if first:

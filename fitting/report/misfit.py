@@ -16,10 +16,12 @@ from .style import (
     SKY,
     VERMILION,
     canvas,
+    per,
     picture,
     plain,
     scale_of,
     styled,
+    terms_in,
 )
 
 WIDTH = 10.0
@@ -81,11 +83,12 @@ def traces(evidence, stem: str = "traces"):
 
 def against(evidence, stem: str = "against"):
     """The residual against field and rate, by branch, and chi2/N against frequency."""
+    terms = terms_in(evidence)
     with styled():
         figure = canvas(WIDTH, 2.9)
         axes = [figure.add_axes([0.065 + k / 3, 0.18, 0.255, 0.72]) for k in range(3)]
         for ax, key in zip(axes, ("field", "rate"), strict=False):
-            _branches(ax, evidence["against"][key], key)
+            _branches(ax, evidence["against"][key], key, terms)
         axes[0].legend(loc="best", handlelength=1.6)
         axes[0].set_ylabel("residual / noise of a sample")
         frequency, chi2 = evidence["frequency"], evidence["chi2"]
@@ -100,19 +103,19 @@ def against(evidence, stem: str = "against"):
         )
         axes[2].set_yscale("log")
         plain_ticks(axes[2], "xy")
-        axes[0].set_title("against the applied field")
+        axes[0].set_title(f"against the {terms.applied}")
         axes[1].set_title("against its rate of change")
         caption = (
             "Means of the residual with two standard errors, rising and falling branch apart; the grey band holds 90 % of the samples. "
             "Right: misfit of each recording against its frequency; the band is where noise alone would put it."
         )
-        return picture(figure, stem, "Residual against field, rate and frequency", caption)
+        return picture(figure, stem, f"Residual against {terms.field}, rate and frequency", caption)
 
 
-def _branches(axes, found, key):
+def _branches(axes, found, key, terms):
     edges = found["edges"]
     middle = 0.5 * (edges[1:] + edges[:-1]) if key == "field" else np.sqrt(edges[1:] * edges[:-1])
-    scale, unit = (1e-3, "kA/m") if np.abs(edges).max() > 2e3 and key == "field" else (1.0, "A/m")
+    scale, unit = terms.scaled(np.abs(edges).max() if key == "field" else 0.0)
     low, high = np.fmin(found["rising"][2], found["falling"][2]), np.fmax(found["rising"][3], found["falling"][3])
     keep = np.isfinite(low)
     axes.fill_between(scale * middle[keep], low[keep], high[keep], color=PALE, lw=0, alpha=0.6)
@@ -132,9 +135,9 @@ def _branches(axes, found, key):
         )
     if key == "rate":
         axes.set_xscale("log")
-        axes.set_xlabel("|dH/dt| applied / (A/m/s)")
+        axes.set_xlabel(f"|d{terms.field_letter}/dt| applied / ({terms.unit}/s)")
     else:
-        axes.set_xlabel(f"applied field / ({unit})")
+        axes.set_xlabel(f"{terms.applied} / {per(unit)}")
 
 
 def plain_ticks(axes, which):

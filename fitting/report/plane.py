@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.colors import PowerNorm
 
-from .style import INK, MUTED, SEQUENTIAL, canvas, percent, picture, styled
+from .style import INK, MUTED, SEQUENTIAL, canvas, per, percent, picture, styled, terms_in
 
 
 def never_switched(evidence) -> str:
@@ -23,7 +23,8 @@ def mass_map(evidence, stem: str = "masses"):
     found = evidence["plane"]
     lower = np.tril(np.ones(found["masses"].shape, bool))
     seen = found["seen"].astype(bool) & lower
-    scale, unit = (1e-3, "kA/m") if np.abs(found["levels"]).max() > 2e3 else (1.0, "A/m")
+    terms = terms_in(evidence)
+    scale, unit = terms.scaled(np.abs(found["levels"]).max())
     levels = scale * found["levels"]
     known = np.isfinite(found["errors"]).all()
     masses, errors = found["masses"], found["errors"]
@@ -32,9 +33,9 @@ def mass_map(evidence, stem: str = "masses"):
     well = float(masses[seen & (errors < 0.3 * masses)].sum() / max(masses[seen].sum(), 1e-300)) if known else float("nan")
     with styled():
         figure = canvas(10.0, 4.3)
-        _panel(figure, 0.07, masses, lower, seen, levels, unit, "mass of a cell / (A/m)", "Masses")
+        _panel(figure, 0.07, masses, lower, seen, levels, unit, f"mass of a cell / {per(terms.state_unit)}", "Masses")
         if known:
-            _panel(figure, 0.57, errors, lower, seen, levels, unit, "standard error / (A/m)", "Standard errors")
+            _panel(figure, 0.57, errors, lower, seen, levels, unit, f"standard error / {per(terms.state_unit)}", "Standard errors")
         caption = (
             f"Masses of the relays over their thresholds, at level {len(masses)}, and the standard error of each; colours go with the square root. "
             + (
@@ -65,7 +66,7 @@ def _panel(figure, left, values, lower, seen, levels, unit, label, title):
         cells = unseen.astype(float).repeat(2, axis=0).repeat(2, axis=1)
         axes.contourf(ends, ends, cells, levels=[0.5, 1.5], colors=["#ededed"], hatches=["////"])
     axes.plot([levels[0], levels[-1]], [levels[0], levels[-1]], color=MUTED, lw=0.6)
-    axes.set(xlabel=f"β / ({unit})", ylabel=f"α / ({unit})", xlim=extent[:2], ylim=extent[2:])
+    axes.set(xlabel=f"β / {per(unit)}", ylabel=f"α / {per(unit)}", xlim=extent[:2], ylim=extent[2:])
     axes.set_title(title, loc="left", color=INK)
     bar = figure.colorbar(drawn, cax=figure.add_axes([left + 0.345, 0.12, 0.012, 0.335 * 10 / 4.3]), extend="max")
     bar.set_label(label)

@@ -11,6 +11,8 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from magjax.terms import Terms, terms_of
+
 INK, MUTED, PALE = "#1a1a1a", "#555555", "#c8c8c8"
 BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#007F5C", "#E69F00", "#56B4E9", "#A3527F"
 MEASURED, MODEL, AFTER = BLUE, VERMILION, GREEN
@@ -44,12 +46,23 @@ def scale_of(output: str) -> tuple[float, str, float, str]:
         "displacement": (1e6, "displacement / µm", 1e9, "nm"),
         "flux_density": (1.0, "flux density / T", 1e3, "mT"),
         "magnetization": (1e-3, "magnetization / (kA/m)", 1.0, "A/m"),
+        "polarization": (1.0, "polarization / (C/m²)", 1e3, "mC/m²"),
     }[output]
+
+
+def terms_in(evidence) -> Terms:
+    """The words and units of the bench that the evidence is of; a magnetic one where it is not said."""
+    return terms_of(str(evidence.get("drive", "current")))
 
 
 def drive_label(drive: str) -> tuple[float, str]:
     """(factor, label) of the drive."""
-    return (1.0, "current / A") if drive == "current" else (1.0, "applied field / (A/m)")
+    return 1.0, {"current": "current / A", "field": "applied field / (A/m)", "voltage": "voltage / V"}[drive]
+
+
+def per(unit: str) -> str:
+    """A unit after a slash: in brackets where it is a quotient."""
+    return f"({unit})" if "/" in unit else unit
 
 
 def plain(value: float, digits: int = 3) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 from ..reach import beyond_text
 from .style import plain, scale_of, unit_text
 
-CHANNEL_OF = {"m": "displacement", "T": "flux_density", "A/m": "magnetization"}
+CHANNEL_OF = {"m": "displacement", "T": "flux_density", "A/m": "magnetization", "C/m^2": "polarization"}
 
 
 def table(caption, head, rows, note: str = "", code: bool = False) -> dict:

@@ -6,6 +6,8 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
+from magjax.terms import MAGNETIC
+
 from ..result import write_atomically, write_model
 from . import store
 from .page import rebuild
@@ -46,7 +48,7 @@ def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduc
         found["recordings"] = evidence.of_recordings(named_first)
     elif base is not None:
         found["base"] = evidence.of_fit(base, inside=repaired is None)
-        found["catalogue"] = json.dumps(catalogue())
+        found["catalogue"] = json.dumps(catalogue(base.bench.terms))
         if repaired is not None:
             found["repaired"] = evidence.of_fit(repaired, chosen=[int(k) for k in found["base"]["chosen"]])
         if checks:
@@ -55,7 +57,7 @@ def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduc
     rebuild(folder, progress)
 
 
-def catalogue() -> dict:
+def catalogue(terms=MAGNETIC) -> dict:
     """What the page tells of each effect: block, law, signature, source, unit and the top of its typical range."""
     from magjax.effects import CATALOGUE
 
@@ -65,7 +67,7 @@ def catalogue() -> dict:
         typical = max((abs(t) for t in info.typical), default=None) if info.typical else None
         rows[effect.name] = {
             "block": effect.block, "law": effect.law.rstrip("."), "signature": effect.signature.rstrip("."), "source": effect.source.rstrip("."),
-            "unit": info.unit, "typical": typical,
+            "unit": terms.unit_of(info.unit), "typical": typical,
         }  # fmt: skip
     return rows
 

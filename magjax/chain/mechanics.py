@@ -33,8 +33,9 @@ class Mechanics(eqx.Module):
     def _march(self, u, dt):
         w0 = 2 * jnp.pi * self.f0
         zero, one = jnp.zeros_like(w0), jnp.ones_like(w0)
-        # states y, y' with the forcing's present value and its slope a step appended: one matrix exponential is exact
-        rows = [[zero, one, zero, zero], [-(w0**2), -2 * self.xi * w0, w0**2, zero], [zero, zero, zero, one / dt], [zero] * 4]
+        # states y, y'/w0 with the forcing's present value and its slope a step appended: one matrix exponential is exact;
+        # y' itself would make entries of w0^2, too large for it where a step holds many periods of a stiff stack
+        rows = [[zero, w0, zero, zero], [-w0, -2 * self.xi * w0, w0, zero], [zero, zero, zero, one / dt], [zero] * 4]
         full = jax.scipy.linalg.expm(dt * jnp.stack([jnp.stack(r) for r in rows]))
         A, b_now, b_slope = full[:2, :2], full[:2, 2], full[:2, 3]
 

@@ -33,6 +33,16 @@ def run_ports(arguments) -> int:
     return 0
 
 
+def driven_by_current(bench):
+    """The bench, where its device is driven by a current; else the error that says what to do instead."""
+    if bench.drive == "voltage":
+        raise ConfigurationError(
+            f"bench {bench.name}: is driven by a voltage, these devices by a current; record it with your own instruments as CSV "
+            "(time_s, voltage_V, displacement_um) and give the files to magjax check, fit and diagnose"
+        )
+    return bench
+
+
 def _hidden(words) -> dict:
     """Effect name -> parameters, from words such as sensor_lag:tau=1e-4,order2=0.5."""
     found = {}
@@ -129,7 +139,7 @@ def _response(options, faults):
         return PlainResponse(options.exact), 1.5
     from magjax.bench import load_bench
 
-    bench = load_bench(options.bench)
+    bench = driven_by_current(load_bench(options.bench))
     actuator = None
     if not options.as_stated:
         from .runtime import prepare_jax
@@ -201,7 +211,7 @@ def _run_single(options, arguments) -> int:
     from magjax.acquire.process import record
     from magjax.bench import load_bench
 
-    bench = load_bench(options.bench)
+    bench = driven_by_current(load_bench(options.bench))
     path = Path(options.out)
     writable(path)
     if path.suffix.lower() != ".mjlog":
@@ -239,7 +249,7 @@ def campaign(options, arguments, command, live, say):
 
     from .runtime import output_folder
 
-    bench = load_bench(options.bench)
+    bench = driven_by_current(load_bench(options.bench))
     limit = bench.limits.get("current_A") if options.limit is None else options.limit
     if limit is not None and not 0 < limit < float("inf"):
         raise ConfigurationError(f"--limit = {limit:g}; give a number above zero")

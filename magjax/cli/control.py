@@ -31,12 +31,12 @@ def run(command: str, arguments: list[str]) -> int:
 
 def run_invert(arguments) -> int:
     """magjax invert."""
-    p = parser("invert", "The current that makes the actuator follow a wanted displacement, by T&B (7).",
+    p = parser("invert", "The current (of a piezo stack the voltage) that makes the actuator follow a wanted displacement, by T&B (7).",
                "magjax invert wanted.csv --model result --out current.csv")  # fmt: skip
     p.add_argument("trajectory", help="CSV with time_s and displacement_m (or _um)")
     p.add_argument("--bench", help="bench file (TOML) or a built-in name")
     p.add_argument("--model", help="a fitted result folder")
-    p.add_argument("--out", default="current.csv", help="CSV to write: time_s, current_A")
+    p.add_argument("--out", default="current.csv", help="CSV to write: time_s, current_A (voltage_V)")
     p.add_argument(
         "--of-reading", action="store_true", help="the trajectory is that of the sensor's reading: undo its lag and delay too"
     )

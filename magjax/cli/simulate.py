@@ -64,11 +64,11 @@ def run_simulate(arguments) -> int:
                  "magjax simulate --model result --frequency 50 --amplitude 0.8 --offset 0.1 --out run.nc")  # fmt: skip
     p.add_argument(
         "--drive",
-        help="a file whose drive is applied: time and current (or field) suffice; whole periods are led to their steady state",
+        help="a file whose drive is applied: time and current (or field, voltage) suffice; whole periods are led to their steady state",
     )
     p.add_argument("--frequency", type=float, default=50.0, help="Hz")
-    p.add_argument("--amplitude", type=float, default=0.5, help="A")
-    p.add_argument("--offset", type=float, default=0.0, help="A")
+    p.add_argument("--amplitude", type=float, default=0.5, help="in the unit of the drive: A, A/m of a known field, V of a stack")
+    p.add_argument("--offset", type=float, default=0.0, help="in the same unit")
     p.add_argument("--samples", type=int, default=1000, help="samples a period")
     p.add_argument("--out", default="simulation.nc", help="NetCDF file")
     options = p.parse_args(arguments)
@@ -117,8 +117,8 @@ def run_sweep(arguments) -> int:
     p = _options("sweep", "Steady states over frequencies x amplitudes x offsets, to NetCDF.",
                  "magjax sweep --frequencies 10:300:30 --amplitudes 0.1:0.8:8 --out sweep.nc")  # fmt: skip
     p.add_argument("--frequencies", default="10:300:30", help="Hz: a list or low:high:count")
-    p.add_argument("--amplitudes", default="0.2,0.5,0.8", help="A")
-    p.add_argument("--offsets", default="0", help="A")
+    p.add_argument("--amplitudes", default="0.2,0.5,0.8", help="in the unit of the drive: A, A/m of a known field, V of a stack")
+    p.add_argument("--offsets", default="0", help="in the same unit")
     p.add_argument("--out", default="sweep.nc", help="NetCDF file")
     add_where(p, "finished chunks")
     options = p.parse_args(arguments)

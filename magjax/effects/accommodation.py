@@ -38,6 +38,6 @@ class Accommodation(AbstractEffect):
         mean, field, direction = state
         now = jnp.sign(trial.field - field)
         turned = now * direction < 0
-        scale = actuator.magnetostriction.M_s if actuator.magnetostriction is not None else jnp.sum(actuator.hysteresis.masses)
+        scale = actuator.strained.M_s if actuator.strained is not None else jnp.sum(actuator.hysteresis.masses)
         taken = (1 - MEMORY) * mean + MEMORY * trial.magnetization / scale
         return (jnp.where(turned, taken, mean), trial.field, jnp.where(now == 0, direction, now))

@@ -37,6 +37,7 @@ class AmplifierClipping(AbstractEffect):
     source = "voltage compliance of a linear amplifier, |L dI/dt + R I| <= V_max"
     signature = "flattened crests at the largest amplitude, at high frequency first; nothing below the limit"
     amplitude = "inverse_limit"
+    magnetic = True
 
     @classmethod
     def finite_trials(cls, drives, steps):

@@ -41,7 +41,8 @@ class AbstractEffect(eqx.Module):
     `name`, `block` (one of chain.BLOCKS), `law` (the equation), `source` (literature), `signature` (how it shows in
     data), `in_step` (solved inside the step of (4)), `slow` (its state takes longer than
     a few periods: `settled` leads it to where it repeats), `record_level` (acts on the whole record, not period by period),
-    `amplitude` (the parameter whose null removes the effect), `shells` (into so many the rod is cut, see chain.shells; 0: not).
+    `amplitude` (the parameter whose null removes the effect), `shells` (into so many the rod is cut, see chain.shells; 0: not),
+    `magnetic` (it means nothing in a stack under voltage, as all of the coil and of the magnetostriction do).
     """
 
     name: ClassVar[str] = ""
@@ -54,10 +55,21 @@ class AbstractEffect(eqx.Module):
     slow: ClassVar[bool] = False
     record_level: ClassVar[bool] = False
     shells: ClassVar[int] = 0
+    magnetic: ClassVar[bool] = False
 
     def with_amplitude(self, value):
         """The same effect with its amplitude parameter replaced."""
         return eqx.tree_at(lambda e: getattr(e, self.amplitude), self, jnp.asarray(value, dtype=float))
+
+    @classmethod
+    def serves(cls, actuator) -> bool:
+        """Whether it can act in this actuator: a stack under voltage has no coil and no magnetostriction."""
+        return actuator.coil.drive != "voltage" or cls.electric()
+
+    @classmethod
+    def electric(cls) -> bool:
+        """Whether it means anything in a stack under voltage."""
+        return not (cls.magnetic or cls.block in ("coil", "magnetostriction"))
 
     @classmethod
     def parameters(cls):

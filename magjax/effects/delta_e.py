@@ -30,6 +30,7 @@ class DeltaE(AbstractEffect):
     source = "A. E. Clark, H. T. Savage, IEEE Trans. Sonics Ultrason. 22 (1975) 50 (giant Delta-E of Terfenol)"
     signature = "phase and gain near the resonance change with bias; rate-dependent distortion"
     amplitude = "e"
+    magnetic = True
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with a stiffness that follows m^2, m."""

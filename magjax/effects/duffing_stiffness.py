@@ -26,7 +26,7 @@ class DuffingStiffness(AbstractEffect):
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with the cubic spring, m."""
-        reach = actuator.magnetostriction.reach
+        reach = actuator.strained.reach
 
         def spring(y):
             square = (y / reach) ** 2

@@ -17,6 +17,7 @@ class InductiveCrosstalk(AbstractEffect):
     source = "mutual inductance between drive leads and sensor leads"
     signature = "in quadrature with the current, growing with frequency, at the drive's own lines only"
     amplitude = "kappa"
+    magnetic = True
 
     def reading(self, reading, signals, line, actuator):
         """Reading with crosstalk."""

@@ -33,6 +33,7 @@ class MagneticAftereffect(AbstractEffect):
     source = "R. Street, J. C. Woolley, Proc. Phys. Soc. A 62 (1949) 562: M(t) ~ S log t; L. Neel, J. Phys. Radium 11 (1950) 49: as a field"
     signature = "a lag that hardly depends on frequency; the first periods drift"
     amplitude = "share"
+    magnetic = True
     in_step = True
     slow = True
 

@@ -20,6 +20,7 @@ class ReversibleMagnetization(AbstractEffect):
     source = "E. Della Torre, Magnetic Hysteresis (1999), state-dependent reversible component"
     signature = "minor loops keep a slope at their tips that does not depend on their size; diagonal masses absorb most of it"
     amplitude = "chi_r"
+    magnetic = True
     in_step = True
 
     def _scale(self, actuator):

@@ -32,7 +32,7 @@ class SensorNonlinearity(AbstractEffect):
 
     def reading(self, reading, signals, line, actuator):
         """Reading through the curve."""
-        reach = actuator.magnetostriction.reach if actuator.magnetostriction is not None else 1.0
+        reach = actuator.strained.reach if actuator.strained is not None else 1.0
         part = reading / reach
         return reading + reach * part * part * self.q2 * (
             1 + part * (self.c3 + part * (self.c4 + part * (self.c5 + part * self.c6)))

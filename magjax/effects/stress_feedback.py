@@ -21,6 +21,7 @@ class StressFeedback(AbstractEffect):
     source = "D. C. Jiles, J. Phys. D 28 (1995) 1537: stress field (3 sigma / (2 mu0)) d lambda / dM"
     signature = "the loop deforms where y is large, and through the resonance with frequency"
     amplitude = "stiffness"
+    magnetic = True
     in_step = True
 
     def start(self, trial, actuator):

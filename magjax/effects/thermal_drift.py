@@ -21,6 +21,7 @@ class ThermalDrift(AbstractEffect):
     source = "one-node thermal model of a coil on a rod"
     signature = "a drift through the record that grows with the squared current; it lives between the harmonics"
     amplitude = "rate"
+    magnetic = True
     record_level = True
 
     def reading(self, reading, signals, line, actuator):

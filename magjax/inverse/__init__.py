@@ -2,5 +2,6 @@
 
 from .dynamic import PlainActuator, current_for_displacement, implicit_euler
 from .operator import PlainPreisach
+from .stack import PlainStack, voltage_for_displacement
 
-__all__ = ["PlainActuator", "PlainPreisach", "current_for_displacement", "implicit_euler"]
+__all__ = ["PlainActuator", "PlainPreisach", "PlainStack", "current_for_displacement", "implicit_euler", "voltage_for_displacement"]

@@ -1,4 +1,4 @@
-"""What `magjax invert` does: a wanted displacement in a file to the current in a file."""
+"""What `magjax invert` does: a wanted displacement in a file to the current (of a piezo stack the voltage) in a file."""
 
 import contextlib
 from pathlib import Path
@@ -7,6 +7,8 @@ import numpy as np
 
 from ..errors import ConfigurationError, RecordingError
 from .dynamic import KNOWN_INVERSES, SENSOR_INVERSES, PlainActuator, current_for_displacement, nearest_feasible, undo_sensor
+from .stack import KNOWN_INVERSES as STACK_INVERSES
+from .stack import PlainStack, voltage_for_displacement
 
 LONGEST_M = 5e-3  # no actuator of this kind moves further: the unit is wrong
 
@@ -17,9 +19,12 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
     Where the wanted displacement is not feasible a third column, displacement_m, is the nearest feasible one that the
     current is for.
     """
-    plant = PlainActuator.from_actuator(load_actuator(bench, model))
+    actuator = load_actuator(bench, model)
     time, wanted = read_trajectory(Path(trajectory))
     h = float(np.median(np.diff(time)))
+    if actuator.coil.drive == "voltage":
+        return _invert_stack(actuator, trajectory, time, wanted, h, out, of_reading)
+    plant = PlainActuator.from_actuator(actuator)
     current, infeasible, saturated = current_for_displacement(plant, wanted, h, of_reading)
     if infeasible.all():
         stroke = 1e6 * plant.l_rod * plant.lambda_s
@@ -50,6 +55,28 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
         "not_compensated": left,
         "message": text,
     }
+
+
+def _invert_stack(actuator, trajectory, time, wanted, h, out, of_reading) -> dict:
+    """`invert_file` for a piezo stack: writes time_s and voltage_V."""
+    plant = PlainStack.from_actuator(actuator)
+    voltage, beyond = voltage_for_displacement(plant, wanted, h, of_reading)
+    if beyond.all():
+        low, high = (1e6 * v for v in plant.range)
+        raise RecordingError(
+            f"{trajectory}: no sample can be reached ({1e6 * wanted.min():.4g} .. {1e6 * wanted.max():.4g} um are wanted, "
+            f"the stack moves between {low:.4g} and {high:.4g} um); check unit and zero"
+        )
+    write_table(out, [time, voltage], "time_s,voltage_V")
+    left = [e for e in plant.effects if e not in (*STACK_INVERSES, *(SENSOR_INVERSES if of_reading else ()))]
+    text = f"voltage {voltage.min():.4g} .. {voltage.max():.4g} V; wrote {out}"
+    if beyond.any():
+        text += (
+            f"; {int(beyond.sum())} samples need a voltage outside the fitted plane, first at t = {time[np.argmax(beyond)]:.4g} s"
+        )
+    if left:
+        text += f"; not compensated: {', '.join(left)}"
+    return {"file": str(out), "infeasible": 0, "saturated": int(beyond.sum()), "not_compensated": left, "message": text}
 
 
 def write_table(out, columns, names: str) -> None:

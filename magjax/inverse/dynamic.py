@@ -41,7 +41,9 @@ class PlainActuator:
     def from_actuator(actuator) -> "PlainActuator":
         """From any object with the attributes of `magjax.actuator.Actuator`."""
         if getattr(actuator, "mechanics", None) is None or not hasattr(actuator.coil, "R_eddy"):
-            raise ConfigurationError("only a current-driven bench with mechanics can be inverted for a displacement")
+            raise ConfigurationError(
+                "this needs a bench with mechanics that is driven by a current (of a piezo stack magjax invert gives the voltage)"
+            )
         h, c, m, s = actuator.hysteresis.rested(), actuator.coil, actuator.magnetostriction, actuator.mechanics
         operator = PlainPreisach(np.asarray(h.masses), float(h.low), float(h.high), float(h.offset), np.asarray(h.history))
         effects = {e.name: {p: float(np.asarray(getattr(e, p))) for p in e.parameters()} for e in actuator.effects}
@@ -84,20 +86,22 @@ def second_mode_force(plant: PlainActuator, displacement, h: float):
     return np.fft.irfft(U, len(whole))[pad : pad + len(y)]
 
 
+def free_displacement(plant, displacement, h: float):
+    """y'' / w0^2 + 2 xi y' / w0 + y of (5), m: what the material must do for a wanted displacement; a second mode of the plant too."""
+    y = np.asarray(displacement, float)
+    if "second_mode" in plant.effects:
+        return second_mode_force(plant, y, h)
+    w0, speed = 2 * np.pi * plant.f0, np.gradient(y, h)
+    return np.gradient(speed, h) / w0**2 + 2 * plant.xi / w0 * speed + y
+
+
 def feasible_magnetization(plant: PlainActuator, displacement, h: float):
     """M_bar = sqrt(u_bar) of (5) for a wanted displacement, and which samples had to be made feasible.
 
     u_bar = M_s^2/(l_rod lambda_s) (y'' / w0^2 + 2 xi y'/w0 + y) must lie in [0, M_s^2]; the nearest value that does
     is taken elsewhere. A second mode and a quartic law of the plant are inverted too.
     """
-    y = np.asarray(displacement, float)
-    w0 = 2 * np.pi * plant.f0
-    if "second_mode" in plant.effects:
-        force = second_mode_force(plant, y, h)
-    else:
-        speed = np.gradient(y, h)
-        force = np.gradient(speed, h) / w0**2 + 2 * plant.xi / w0 * speed + y
-    square = force / (plant.l_rod * plant.lambda_s)
+    square = free_displacement(plant, displacement, h) / (plant.l_rod * plant.lambda_s)
     wrong = (square < 0) | (square > 1)
     return magnetization_for(plant, square), wrong
 

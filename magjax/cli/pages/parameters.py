@@ -4,7 +4,7 @@ import re
 import sys
 
 from magjax import bench
-from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics, Sensor
+from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics, Piezo, Sensor
 from magjax.effects import CATALOGUE
 from magjax.page import deliver, extent, number, table
 from magjax.param import parameters_of
@@ -27,6 +27,12 @@ BLOCKS = (
     ("coil", Coil, "Driven by a current, T&B (3)-(4): `H + k dB/dt = c0 I + H_bias` with `k = c0 N_m A_m / R_eddy`."),
     ("coil", FieldCoil, "Driven by a known field, where `[coil]` holds `k_eddy`: `H + k dB/dt = applied field`."),
     ("magnetostriction", Magnetostriction, "T&B (5), forcing: free displacement `l_rod lambda_s (M/M_s)^2`."),
+    (
+        "piezo",
+        Piezo,
+        "A stack under voltage, without [coil] and [magnetostriction]: `u = stroke P / V_m`, `P = Gamma[V] + chi V`, P in V; see "
+        "[transducers.md](transducers.md). `P_m` stands for `stroke` where a polarization is read.",
+    ),
     ("mechanics", Mechanics, "T&B (5): `y'' + 2 xi w0 y' + w0^2 y = w0^2 u`, `w0 = 2 pi f0`."),
     ("sensor", Sensor, "What the sensor adds."),
 )
@@ -40,8 +46,9 @@ SETTINGS = {
     + ' (default "auto", which is "negative_saturation"; a fit tries the three), or a list of the fields, A/m, that led there from negative saturation, oldest first',
     "limits.current_A": "largest current, A: bounds the Preisach plane of `simulate` (by 0.9 where none is stated), what `record` may drive and what is asked for next",
     "limits.field_A_per_m": "the same for a bench that is driven by a field, A/m (300 where none is stated)",
+    "limits.voltage_V": "the same for a piezo stack, V (150 where none is stated)",
     "fit.free": 'what a fit frees: "hysteresis.masses" and any "block.parameter" of the tables above',
-    "fit.output": "the measured quantity that is fitted (default: displacement, or flux_density without [magnetostriction])",
+    "fit.output": "the measured quantity that is fitted (default: displacement, or flux_density without [magnetostriction] and [piezo])",
     "fit.priors": "standard deviation of a free parameter about its stated value, SI, above zero, by its full name, as in `coil.R_eddy = 2.0`",
 }
 COLUMNS = {
