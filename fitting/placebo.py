@@ -21,7 +21,7 @@ from .verdict import Z_THRESHOLD, too_little
 def placebo(result, recordings, runs: int = 20, *, seed: int = 0, executor=None, checkpoint=None, progress=None) -> dict:
     """Search `runs` simulations of the final model for what they do not lack: the entry "placebo" of diagnosis.json.
 
-    `result`: the `FitResult` of the final model (repaired or base) of a `Diagnosis`; `recordings`: those of the diagnosis;
+    `result`: the `final_model` of a `Diagnosis`; `recordings`: those of the diagnosis;
     `executor`, `checkpoint`, `progress` as in `magjax.scale.run_job`, a run is a chunk. Raises `ConfigurationError` below one run.
     """
     if runs < 1:
@@ -38,6 +38,12 @@ def placebo(result, recordings, runs: int = 20, *, seed: int = 0, executor=None,
         "named": {name: named.count(name) for name in dict.fromkeys(named)},
         "screening_alarms": sum(row["highest_z"] >= Z_THRESHOLD for row in rows), "highest_z": [row["highest_z"] for row in rows],
     }  # fmt: skip
+
+
+def final_model(found):
+    """The `FitResult` that stands in for the truth: the repaired one, the base where nothing named repairs it."""
+    named = found.repaired is not None and not any(e.name == "learned_term" for e in found.repaired.actuator.effects)
+    return found.repaired if named else found.base
 
 
 def _timeless(result):

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import pytest
 import fitting.search as search_module
 from fitting.demo import concealed_actuator, record
 from fitting.fit import fit
-from fitting.placebo import placebo
+from fitting.placebo import final_model, placebo
 from fitting.scale.bootstrap import model_lines
 from fitting.setup import Choices
 from magjax.bench import load_bench
@@ -81,6 +82,16 @@ def test_a_search_that_adopts_an_effect_cries_wolf(final, runs, monkeypatch):
 @pytest.mark.long
 def test_two_processes_search_alike(final, runs):
     assert digest(placebo(final, runs, 2, executor="processes:2")) == digest(placebo(final, runs, 2))
+
+
+def test_the_final_model():
+    def fitted(*effects):
+        return SimpleNamespace(actuator=SimpleNamespace(effects=[SimpleNamespace(name=n) for n in effects]))
+
+    base, named, learned = fitted(), fitted("creep"), fitted("creep", "learned_term")
+    assert final_model(SimpleNamespace(base=base, repaired=None)) is base
+    assert final_model(SimpleNamespace(base=base, repaired=named)) is named
+    assert final_model(SimpleNamespace(base=base, repaired=learned)) is base  # what was learned has no law to search beside
 
 
 def test_simulated_lines_are_those_of_the_fit(final):

@@ -102,10 +102,10 @@ def with_placebo(found, recordings, options, progress):
     """The diagnosis with how often the same search cries wolf on simulations of its final model."""
     import dataclasses
 
-    from fitting.placebo import placebo
+    from fitting.placebo import final_model, placebo
 
     more = {"seed": options.seed, "executor": executor_of(options), "checkpoint": options.checkpoint, "progress": progress}
-    return dataclasses.replace(found, placebo=placebo(found.repaired or found.base, recordings, options.placebo, **more))
+    return dataclasses.replace(found, placebo=placebo(final_model(found), recordings, options.placebo, **more))
 
 
 def placebo_text(found) -> str:
