@@ -42,6 +42,7 @@ NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within w
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
 LEADS_WITHIN, RIVALS_OF_TWO, ALIKE = 5.0, 2, 0.05  # of the best's chi2, how many, and how far apart in theirs
+IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
@@ -266,7 +267,7 @@ def _of_two(recordings, bench, best, left, good, choices, chosen, progress):
 
     One effect with shapes of its own imitates two others better than either of them alone.
     """
-    if best.result.chi2_per_sample < MISFIT:
+    if best.result.chi2_per_sample < MISFIT or best.explained_share < IMITATES:
         return best, left
     tried = [best]
     for rival in sorted((t for t in good if t is not best), key=lambda t: chi2_of(t.result)):
