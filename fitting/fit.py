@@ -3,6 +3,7 @@
 import dataclasses
 import time
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -196,14 +197,17 @@ def _resample(problem, solution, spectra, actuator, bench, names, choices):
     return build_problem(spectra, actuator.replace(values), bench, names, choices)
 
 
+_actuator_at = eqx.filter_jit(lambda layout, template, z: layout.actuator(template, z))  # one program, not one an operation
+
+
 def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult:
     """Estimates (quoted with a tenth of the roughness weights), per-recording misfit, outcome."""
-    fitted = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
+    fitted = _actuator_at(problem.layout, problem.template, jnp.asarray(solution.z))
     count = problem.data_count
     refined = solution
     if solution.chi2 / count < 20:
         refined = solve(problem, solution.z, UNDERSMOOTH * solution.weights, max_jacobians=4, evidence=False)
-    quoted = problem.layout.actuator(problem.template, jnp.asarray(refined.z))
+    quoted = _actuator_at(problem.layout, problem.template, jnp.asarray(refined.z))
     rows = estimates(problem, refined, quoted)
     residual = data_residual(problem, solution.z)
     per_recording = recording_fits(problem, residual, recordings, bench)

@@ -21,6 +21,12 @@ from .density import DensityBasis
 MEMORY = 3e-4  # of the total; prior deviation of each recording's level of M
 
 
+def on_device(values):
+    """Numbers as a JAX array of floats or complex ones; `jnp.asarray` would compile a program for every new shape."""
+    values = np.asarray(values)
+    return jax.device_put(values if values.dtype.kind in "fc" else values.astype(float))
+
+
 class Layout(eqx.Module):
     """Order of the unknowns: [density, bottom of M / total, free physical parameters in the optimiser's coordinates,
     level of M of each recording].
@@ -45,9 +51,9 @@ class Layout(eqx.Module):
     def build(basis, names, starts, scales, log, memories: int = 0) -> "Layout":
         """From a density basis and the free parameters' names, start values, scales and coordinate kinds."""
         return Layout(
-            jnp.asarray(basis.cells), tuple(jnp.asarray(D) for D in basis.penalties), jnp.asarray(basis.total),
-            jnp.asarray(starts, dtype=float), jnp.asarray(scales, dtype=float), tuple(names), tuple(log), memories,
-            None if basis.held is None else jnp.asarray(basis.held),
+            on_device(basis.cells), tuple(on_device(D) for D in basis.penalties), on_device(basis.total),
+            on_device(starts), on_device(scales), tuple(names), tuple(log), memories,
+            None if basis.held is None else on_device(basis.held),
         )  # fmt: skip
 
     @property
@@ -155,7 +161,7 @@ class Predictor(eqx.Module):
         grids = period_grids(spectra, samples)
         order = np.argsort(np.concatenate([g.index for g in grids]))
         return Predictor(
-            tuple(jnp.asarray(g.drive) for g in grids), tuple(jnp.asarray(g.dt) for g in grids),
+            tuple(on_device(g.drive) for g in grids), tuple(on_device(g.dt) for g in grids),
             tuple(int(k) for k in order), harmonics, periods, corners,
         )  # fmt: skip
 

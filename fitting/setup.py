@@ -2,17 +2,16 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.extrema import nesting
+from magjax.param import in_numpy
 
 from .density import cell_basis, hat_basis, held_basis
 from .joint import Problem
-from .model import Layout, Predictor, Target, make_start_actuator
-from .solver import bounded_step
+from .model import Layout, Predictor, Target, make_start_actuator, on_device
+from .solver import padded_step
 from .spectra import HARMONICS, gain_rows, line_deviations, reduce_recording, with_noise
 from .starts import equation_error_start, scan_loss
 from .transients import unsettled_starts
@@ -70,7 +69,8 @@ def _less(recording, output, start):
 def applied_range(spectra, actuator):
     """Lowest and highest applied field over all recordings, A/m."""
     phases = np.arange(500) / 500
-    fields = [np.asarray(actuator.coil.applied_field(s.drive_at(phases))) for s in spectra]
+    coil = in_numpy(actuator.coil)
+    fields = [coil.applied_field(s.drive_at(phases)) for s in spectra]
     return min(f.min() for f in fields), max(f.max() for f in fields)
 
 
@@ -127,31 +127,32 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         crowd = 1.7 if bench.drive == "field" else 1.0
         level = 2 * choices.level if known_field else choices.level
         basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive != "current")
-    zero = float(np.asarray(actuator.coil.applied_field(jnp.asarray(0.0))))
+    zero = float(in_numpy(actuator.coil).applied_field(0.0))
     rest = {"demagnetized": float(np.clip(zero, basis.low, basis.high)), "positive": basis.high}.get(choices.rest, basis.low)
     harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
     deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
     full = [line_deviations(s, s.noise) for s in spectra]
+    memories = len(spectra) if actuator.output == "displacement" else 0
+    solve = padded_step(basis.cells.shape[1] + 1 + len(names) + memories)
     starter = actuator  # its coil holds all of the eddy loss, for the equation error
     for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" and start is None and not held else ():
         # field-driven benches differ by decades: find the scale first
-        found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
+        found = scan_loss(basis, spectra, full, actuator, solve, "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
         actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})
     if "piezo.chi" in names and start is None and not held:
         steepest = float(actuator.piezo.V_m) * max(s.peak_to_peak for s in spectra) / ((high - low) * _full_scale(actuator))
-        found = scan_loss(basis, spectra, full, actuator, jax.jit(bounded_step), "piezo.chi", steepest * np.linspace(0.2, 1.1, 10))
+        found = scan_loss(basis, spectra, full, actuator, solve, "piezo.chi", steepest * np.linspace(0.2, 1.1, 10))
         actuator = starter = actuator.replace({"piezo.chi": found})
     if held:
         start = np.asarray([(actuator.hysteresis.offset - actuator.hysteresis.masses.sum()) / total])
     elif start is None or len(start) != basis.cells.shape[1] + 1:
-        x, bottom, _ = equation_error_start(basis, spectra, full, starter, jax.jit(bounded_step), rest=rest)
+        x, bottom, _ = equation_error_start(basis, spectra, full, starter, solve, rest=rest)
         start = np.append(x, bottom)
     known = actuator.parameters()
     values = [float(known[n][0]) for n in names]
     infos = [known[n][1] for n in names]
     log = [i.low >= 0 and v > 0 and (i.null is None or i.shape) for i, v in zip(infos, values, strict=True)]
     scales = [i.scale for i in infos]
-    memories = len(spectra) if actuator.output == "displacement" else 0
     layout = Layout.build(basis, names, values, scales, log, memories)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
@@ -167,8 +168,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     priors = np.asarray([_prior(bench, *row) for row in zip(names, values, log, infos, strict=True)] + [1.0] * memories)
     rows, shares = gain_rows(spectra, deviations)
     target = Target(
-        jnp.asarray(lines), jnp.asarray(deviations), jnp.asarray(START_WEIGHTS[: len(basis.penalties)]), jnp.asarray(priors), jnp.asarray(1e-3),
-        jnp.asarray(rows), jnp.asarray(shares),
+        *(on_device(x) for x in (lines, deviations, START_WEIGHTS[: len(basis.penalties)], priors, 1e-3, rows, shares))
     )  # fmt: skip
     template = actuator if held else make_start_actuator(actuator, basis, rest)
     if isinstance(bench.start, tuple) and not held:

@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
@@ -93,6 +94,19 @@ def damped_step(normal, gradient, y, damping, nonnegative):
     new = jnp.where(nonnegative, jnp.maximum(y + delta, 0.0), y + delta)
     delta = new - y
     return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
+
+
+def padded_step(size: int):
+    """`bounded_step` for systems of up to `size` unknowns through the program that the fit's own steps of that size run."""
+
+    def step(A, gradient, y, nonnegative):
+        n = len(gradient)
+        whole = np.eye(size)
+        whole[:n, :n] = A
+        gradient, y, nonnegative = (np.concatenate([x, np.zeros(size - n, x.dtype)]) for x in (gradient, y, nonnegative))
+        return (np.asarray(damped_step(whole, gradient, y, 0.0, jnp.asarray(nonnegative))[0]) - y)[:n]
+
+    return step
 
 
 def jacobian(fn, y):

@@ -7,6 +7,7 @@ then linear in the masses: nonnegative least squares with the roughness penaltie
 import numpy as np
 
 from magjax.constants import MU0
+from magjax.param import in_numpy
 from magjax.preisach.operator import unreached_share
 
 from .spectra import evaluate_lines
@@ -77,9 +78,9 @@ def inferred_loops(spectra, deviations, actuator, samples: int = 200):
     """Field and magnetization over a period from the reading, by (4) and (5) backwards: lists of (H, M, trust)."""
     loops = []
     phases = np.arange(samples) / samples
-    coil = actuator.coil
+    coil, mechanics = in_numpy(actuator.coil), in_numpy(actuator.mechanics)
     for s, sigma in zip(spectra, deviations, strict=True):
-        applied = np.asarray(coil.applied_field(s.drive_at(phases)))
+        applied = coil.applied_field(s.drive_at(phases))
         count = min(len(s.reading), samples // 2 - 1)
         keep = np.abs(s.reading[:count]) > 4 * sigma[:count]
         keep[:3] = True
@@ -87,7 +88,7 @@ def inferred_loops(spectra, deviations, actuator, samples: int = 200):
         lines = np.where(keep, s.reading[:count], 0.0)
         if actuator.output == "displacement":
             lines = lines - np.eye(1, count)[0] * float(actuator.sensor.offset)
-            gain = np.asarray(actuator.mechanics.response(w)) if actuator.mechanics is not None else np.ones(count)
+            gain = mechanics.response(w) if mechanics is not None else np.ones(count)
             lines = np.where(np.abs(gain) > 0.05, lines / gain, 0.0)
             free = evaluate_lines(lines, phases)
             share, M_s = free / float(actuator.strained.reach), float(actuator.strained.M_s)

@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from magjax.param import in_numpy
+
 WIDEN = 1.3  # stated errors are widened by this: the evidence weights take the roughness for granted
 WIDEN_BESIDE = 2.6  # the same beside an effect: its law's form is taken for granted too
 GAUGES = {  # free without a prior beside free masses, and why nothing holds them
@@ -67,7 +69,7 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
             at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach)
             start = float(layout.starts[layout.names.index(name)])
             k = layout.names.index(name)
-            gauge, prior = name in GAUGES and layout.density_unknowns > 0, float(problem.target.priors[k])
+            gauge, prior = name in GAUGES and layout.density_unknowns > 0, float(np.asarray(problem.target.priors)[k])
             alone = gauge and prior <= NO_PRIOR
             if gauge and not alone:  # the cells' edges hold it, not the data: known as well as its prior says
                 stderr = max(stderr, abs(slope) / prior)
@@ -97,7 +99,8 @@ def visited_cells(actuator, spectra) -> np.ndarray:
     levels = np.asarray(actuator.hysteresis.levels)
     seen = np.zeros((len(levels) - 1,) * 2, bool)
     phases = np.arange(400) / 400
+    coil = in_numpy(actuator.coil)
     for s in spectra:
-        applied = np.asarray(actuator.coil.applied_field(s.drive_at(phases)))
+        applied = coil.applied_field(s.drive_at(phases))
         seen |= (levels[:-1, None] < applied.max()) & (levels[None, 1:] > applied.min())
     return np.tril(seen)

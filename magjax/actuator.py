@@ -14,7 +14,7 @@ from .chain import BLOCKS, Coil, Electrodes, FieldCoil, Magnetostriction, Mechan
 from .effects import SensorLag
 from .effects.base import AbstractEffect
 from .errors import ConfigurationError
-from .param import parameters_of
+from .param import in_numpy, parameters_of
 from .preisach import Preisach, gaussian_lorentzian_masses
 from .terms import Terms, terms_of
 
@@ -183,6 +183,6 @@ def _check_bench(bench):
 def _plane(bench, coil):
     """Range of the Preisach plane, A/m (V): what the limit of the drive reaches on either side of the bias."""
     largest = float(bench.limit or {"current": 0.9, "field": 300.0, "voltage": 150.0}[bench.drive])
-    ends = [float(coil.applied_field(jnp.asarray(sign * largest))) for sign in (-1, 1)]
+    ends = [float(in_numpy(coil).applied_field(sign * largest)) for sign in (-1, 1)]
     margin = 0.01 * (ends[1] - ends[0])
     return ends[0] - margin, ends[1] + margin

@@ -8,7 +8,9 @@ import dataclasses
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +35,11 @@ class ParameterInfo:
 def as_float_array(value):
     """A JAX float array of the widest enabled precision."""
     return jnp.asarray(value, dtype=float)
+
+
+def in_numpy(module):
+    """The same block with NumPy numbers: what is worked out with it on NumPy signals compiles nothing."""
+    return jax.tree.map(np.asarray, module)
 
 
 def param(default, unit, meaning, low=-math.inf, high=math.inf, scale=None, null=None, shape=False, typical=None):

@@ -128,7 +128,8 @@ def test_the_band_widens_beyond_what_was_seen():
     assert learned.worth and not dataclasses.replace(learned, left_out=(5.0, 4.9)).worth
     low, high, share = region(learned)
     assert 0 <= low < high <= 2e4 and 0 < share <= 1
-    learned = dataclasses.replace(learned, result=types.SimpleNamespace(recordings=[types.SimpleNamespace(unit="m")]))
+    result = types.SimpleNamespace(recordings=[types.SimpleNamespace(unit="m")], bench=load_bench("aa-050h"))
+    learned = dataclasses.replace(learned, result=result)
     content = described(learned)
     assert content["seen"] == [[0.0, 2e4]] and len(content["function"]["x"]) == len(content["function"]["slices"][0]["low"])
 

@@ -12,7 +12,7 @@ from fitting.screen import applicable
 from fitting.setup import Choices, build_problem, spectra_of
 from magjax.bench import load_bench
 from magjax.cli import main
-from magjax.effects import CATALOGUE, Creep, EddyCurrents
+from magjax.effects import CATALOGUE, AmplifierLag, Creep, EddyCurrents
 from magjax.errors import ConfigurationError
 from magjax.inverse import PlainStack, voltage_for_displacement
 from magjax.recording import load_recordings
@@ -136,6 +136,19 @@ def test_the_voltage_for_a_wanted_displacement_leads_there(fitted, tmp_path, cap
     np.savetxt(tmp_path / "far.csv", np.stack([t, wanted + 300], 1), delimiter=",", header="time_s,displacement_um", comments="")
     assert main(["invert", str(tmp_path / "far.csv"), "--model", str(out), "--out", str(tmp_path / "far_voltage.csv")]) == 3
     assert "the stack moves between" in capsys.readouterr().err
+
+
+def test_the_lag_of_the_amplifier_is_made_up_for():
+    actuator = load_bench("piezo-stack").actuator()
+    lagging = actuator.with_effect(AmplifierLag(tau=2e-3))
+    t = np.arange(2000) * 1e-4
+    wanted = 2e-5 + 5e-6 * np.sin(2 * np.pi * 20 * t)
+    missed = []
+    for plant in (actuator, lagging):
+        voltage, beyond = voltage_for_displacement(PlainStack.from_actuator(plant), wanted, 1e-4)
+        assert not beyond.any()
+        missed.append(np.abs(np.asarray(simulate(lagging, voltage, 1e-4).displacement) - wanted)[500:].max())
+    assert missed[1] < 0.05 * missed[0] and missed[0] > 5e-7
 
 
 def test_beyond_the_plane_the_nearest_voltage_is_taken():

@@ -195,7 +195,9 @@ def joint_fit():
 
 
 def grid():
-    """200 x 20 sweep to steady state against the same with the compiled serial loop."""
+    """200 x 20 sweep to steady state against the same with the compiled serial loop; memory above jax's and xarray's imports."""
+    import xarray  # noqa: F401  (56 MB that the result's library takes, whatever is swept)
+
     actuator = actuator_at()
     frequencies, amplitudes = np.linspace(5, 400, 200), np.linspace(0.05, 0.8, 20)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
