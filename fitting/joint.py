@@ -189,6 +189,12 @@ def bent_step(problem: Problem, z, new, residual, J, normal, damping):
     return np.where(problem.layout.nonnegative, np.maximum(bent, 0.0), bent)
 
 
+def cost_of(residual, z, prior) -> float:
+    """Half of chi2 and of what the priors add; infinite where a step has left all reason."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return 0.5 * float(residual @ residual + z @ prior @ z)
+
+
 def solve(
     problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None, target: float = np.inf
 ) -> Solution:
@@ -217,12 +223,12 @@ def solve(
             for _ in range(8):
                 new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounded))
                 trial = data_residual(problem, new)
-                new_cost = 0.5 * float(trial @ trial + new @ prior @ new)
+                new_cost = cost_of(trial, new, prior)
                 ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0
                 if ratio < CURVED and float(predicted) > 1e-4 * cost + 1:
                     bent = bent_step(problem, z, new, residual, J, normal, damping)
                     other = data_residual(problem, bent)
-                    other_cost = 0.5 * float(other @ other + bent @ prior @ bent)
+                    other_cost = cost_of(other, bent, prior)
                     if not other_cost >= new_cost:
                         new, trial, new_cost, ratio = bent, other, other_cost, (cost - other_cost) / float(predicted)
                 good = bool(np.isfinite(new_cost) and ratio > 1e-3)

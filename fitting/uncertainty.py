@@ -4,8 +4,6 @@ import dataclasses
 
 import numpy as np
 
-from magjax.param import in_numpy
-
 WIDEN = 1.3  # stated errors are widened by this: the evidence weights take the roughness for granted
 WIDEN_BESIDE = 2.6  # the same beside an effect: its law's form is taken for granted too
 GAUGES = {  # free without a prior beside free masses, and why nothing holds them
@@ -99,6 +97,8 @@ def visited_cells(actuator, spectra) -> np.ndarray:
     levels = np.asarray(actuator.hysteresis.levels)
     seen = np.zeros((len(levels) - 1,) * 2, bool)
     phases = np.arange(400) / 400
+    from magjax.param import in_numpy  # with JAX, which a report made anew does not need
+
     coil = in_numpy(actuator.coil)
     for s in spectra:
         applied = coil.applied_field(s.drive_at(phases))

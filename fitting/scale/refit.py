@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..joint import Problem, data_jacobian, data_residual, data_residuals, prior_matrix
+from ..joint import Problem, cost_of, data_jacobian, data_residual, data_residuals, prior_matrix
 from ..solver import damped_step
 
 BATCH = 10  # refits side by side: twice as many are slower, a draw, for their Everett tables leave the cache
@@ -49,7 +49,7 @@ def settle(problem: Problem, z, weights, *, jacobian=None, jacobians: int = 4) -
     prior = prior_matrix(problem, weights)
     z = np.asarray(z, float)
     residual = data_residual(problem, z)
-    cost = _cost(residual, z, prior)
+    cost = cost_of(residual, z, prior)
     taken, converged, damping = 0, False, DAMPING
     while True:
         fresh = jacobian is None
@@ -60,7 +60,7 @@ def settle(problem: Problem, z, weights, *, jacobian=None, jacobians: int = 4) -
             gradient = jacobian.T @ residual + prior @ z
             new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounded))
             trial = data_residual(problem, new)
-            new_cost = _cost(trial, new, prior)
+            new_cost = cost_of(trial, new, prior)
             good, converged = _verdict(cost, new_cost, predicted)
             if good:
                 z, residual, cost = new, trial, new_cost
@@ -91,7 +91,7 @@ def settle_each(problem: Problem, lines, z, weights, jacobian) -> list[Settled]:
 def _chords(problem, lines, z, prior, normal, jacobian, bounded):
     """Steps with one Jacobian, each draw until it has settled or a step has not kept its promise."""
     residual = np.array(data_residuals(problem, z, lines))
-    cost = [_cost(*both, prior) for both in zip(residual, z, strict=True)]
+    cost = [cost_of(*both, prior) for both in zip(residual, z, strict=True)]
     going, converged = np.ones(len(z), bool), np.zeros(len(z), bool)
     for _ in range(CHORDS):
         new, predicted = z.copy(), np.zeros(len(z))
@@ -99,7 +99,7 @@ def _chords(problem, lines, z, prior, normal, jacobian, bounded):
             new[k], predicted[k] = damped_step(normal, jacobian.T @ residual[k] + prior @ z[k], z[k], DAMPING, bounded)
         trial = data_residuals(problem, new, lines)
         for k in np.flatnonzero(going):
-            new_cost = _cost(trial[k], new[k], prior)
+            new_cost = cost_of(trial[k], new[k], prior)
             good, converged[k] = _verdict(cost[k], new_cost, predicted[k])
             if good:
                 z[k], residual[k], cost[k] = new[k], trial[k], new_cost
@@ -108,10 +108,6 @@ def _chords(problem, lines, z, prior, normal, jacobian, bounded):
             break
     rows = zip(z, residual, cost, converged, strict=True)
     return [Settled(own, float(r @ r), c, 0, bool(ok), jacobian) for own, r, c, ok in rows]
-
-
-def _cost(residual, z, prior) -> float:
-    return 0.5 * float(residual @ residual + z @ prior @ z)
 
 
 def _verdict(cost, new_cost, predicted) -> tuple[bool, bool]:
