@@ -280,15 +280,15 @@ def main():
     """Print the table and, with --cases, every case; with --table also write it."""
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("suite", choices=list(SUITES))
-    p.add_argument("--out", type=Path, default=Path("blind-results"))
+    p.add_argument("--out", type=Path, nargs="+", default=[Path("blind-results")], help="folder of the runner, or files of --keep")
     p.add_argument("--cases", action="store_true")
     p.add_argument("--table", type=Path)
     p.add_argument("--keep", type=Path)
     options = p.parse_args()
-    rows = list(read(options.suite, options.out))
+    rows = [row for out in options.out for row in read(options.suite, out)]
     if not rows:
         raise SystemExit(
-            f"no finished case of {options.suite} in {options.out}: run python -m tests.blind.run {options.suite} first"
+            f"no finished case of {options.suite} in {options.out[0]}: run python -m tests.blind.run {options.suite} first"
         )
     for case, diagnosis, done in rows if options.cases else ():
         chi = [round((diagnosis[k] or {}).get("chi2_per_sample") or np.nan, 2) for k in ("base", "repaired")] if diagnosis else ""
