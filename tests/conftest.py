@@ -22,6 +22,14 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 STRICT = {"test_fit", "test_preisach", "test_transients"}  # simulation, operator and fit: no rank is promoted by accident
 
 
+LONGEST = ("test_diagnose", "test_measured", "test_blind_suite", "test_hum")  # first, so that no worker ends alone with one of them
+
+
+def pytest_collection_modifyitems(items):
+    """The longest modules first."""
+    items.sort(key=lambda item: item.module.__name__.rpartition(".")[2] not in LONGEST)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def ranks(request):
     """In the modules of STRICT arrays of unlike rank do not meet."""
