@@ -225,6 +225,7 @@ def test_periods_that_do_not_repeat_are_a_data_problem():
         assert (found is not None and "do not repeat" in found) == wrong
 
 
+@pytest.mark.long
 def test_a_sensors_zero_is_adopted_where_it_scores_best_and_told_of_where_an_effect_does_as_well(bench, monkeypatch):
     rng = np.random.default_rng(3)
     truth, zero = concealed_actuator(bench), 6e-6

@@ -34,6 +34,13 @@ def test_nothing_scores_on_harmonics_of_the_mains_without_hum():
     assert z < 5 and len(tones) == 3
 
 
+def test_hum_scores_on_the_harmonics_that_it_falls_on():
+    base = fit(recorded(HUM), BENCH, refine=False)
+    z, tones = hum_score(base.problem, base.refined)
+    assert z > 15 and tones[0] == (50.0, pytest.approx(HUM, rel=0.3))
+
+
+@pytest.mark.long
 def test_hum_that_falls_on_harmonics_is_named_and_no_physics():
     asked = {"quartic_magnetostriction", "sensor_lag", "creep", "second_eddy_path"}  # all of it: the blind suites
     others = tuple(e.name for e in CATALOGUE if e.name not in asked)

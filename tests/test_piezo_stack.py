@@ -199,6 +199,7 @@ def test_a_wrong_bench_is_one_line_with_its_mend(text, words, tmp_path):
         load_bench(path)
 
 
+@pytest.mark.long
 def test_a_polarization_loop_of_a_ferroelectric_sample(tmp_path):
     """The chain ends early: P in C/m^2, of a few hard-switching relays beside a dielectric line."""
     bench = tmp_path / "film.toml"
