@@ -10,9 +10,9 @@ import dataclasses
 
 import numpy as np
 
-from .fit import fit_or_stop as fit
+from magjax.effects import CLASSES
+
 from .screen import Candidate
-from .setup import effect_parameters
 
 LEADERS = 6  # families of directions that are tried
 FAMILY = 0.85  # |cos| of two directions that makes a family
@@ -26,6 +26,7 @@ TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
 WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
 SAME_DIRECTION = 0.97
 OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law imitates another
+AT_NOISE = 0.92  # chi2/N at which a fit with nothing missing ends
 MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
 MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart
 
@@ -51,6 +52,11 @@ class Trial:
 def chi2_of(result) -> float:
     """Total chi2 of a fit."""
     return result.chi2_per_sample * result.data_count
+
+
+def excess_of(result, at_noise: float = AT_NOISE) -> float:
+    """What a fit leaves above the noise: chi2 beyond that of one with nothing missing, which uses up some of its data."""
+    return chi2_of(result) - at_noise * result.data_count
 
 
 # known rivals to first order whose score says little once the base has bent to the other: tried wherever that one is
@@ -88,34 +94,28 @@ def _alike(a: Candidate, b: Candidate) -> float:
     return abs(float(a.direction @ b.direction))
 
 
-def try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress=None, target: float = np.inf) -> Trial:
+def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
     """Fit base + effect, started at the screening's amplitude and from the density of the base.
 
-    `target`: a chi2 that it must come near to be of use.
+    `task`: a `Task`; `target`: a chi2 that it must come near to be of use.
     """
+    effect_class = CLASSES[candidate.name]
     info = effect_class.parameters()[effect_class.amplitude]
     reach = max(abs(t) for t in info.typical) if info.typical else 10 * info.scale
     amplitude = float(np.clip(candidate.amplitude, -reach, reach))
     effect = effect_class(**candidate.shapes).with_amplitude(
         amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale
     )
-    actuator = base.actuator.with_effect(effect)
-    result = fit(
-        recordings, bench, actuator=actuator, start=base, extra=effect_parameters(actuator), choices=choices, refine=False, progress=progress,
-        target=target, spectra=base.spectra,
-    )  # fmt: skip
+    result = task.fit_on(base, base.actuator.with_effect(effect), target=target)
     return credited(candidate, result, base, effect, excess)
 
 
-def settled(recordings, bench, base, trial, excess, progress=None, target: float = np.inf) -> Trial:
+def settled(task, base, trial, excess, target: float = np.inf) -> Trial:
     """The trial, gone on with where it ended far from its start, unsettled, and came near the `target`."""
     result = trial.result
     if result.converged or not chi2_of(result) < target:
         return trial
-    result = fit(
-        recordings, bench, actuator=result.actuator, start=result, extra=effect_parameters(result.actuator), choices=result.choices, refine=False,
-        progress=progress, target=target, spectra=base.spectra,
-    )  # fmt: skip
+    result = task.fit_on(result, result.actuator, choices=result.choices, spectra=base.spectra, target=target)
     return credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
 
 

@@ -100,11 +100,11 @@ def tracking_benches(bench, hidden, parameters, seed: int = 0, progress=None):
     Returns the models before and after the diagnosis and the plant itself as `magjax.inverse.PlainActuator`, and the
     diagnosis as a dict with its verdict and message.
     """
-    from magjax.effects import CATALOGUE
+    from magjax.effects import CLASSES
     from magjax.inverse import PlainActuator
 
     bench = load_bench(bench)
-    effect = {e.name: e for e in CATALOGUE}[hidden](**parameters)
+    effect = CLASSES[hidden](**parameters)
     true = concealed_actuator(bench, effect)
     rng = np.random.default_rng(seed)
     sines = [*SINES, (100, 0.8, 0.0), (200, 0.4, -0.3), (30, 0.85, 0.0)]

@@ -11,9 +11,8 @@ import numpy as np
 from magjax.bench import load_bench
 
 from .alternation import alternating
-from .attribute import MIN_DROP, TIE, WEAK_TIE, chi2_of
+from .attribute import MIN_DROP, TIE, WEAK_TIE, chi2_of, excess_of
 from .fit import FINER_FROM, REFINE_BELOW
-from .fit import fit_or_stop as fit
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term
@@ -21,7 +20,8 @@ from .locate import where
 from .on_lines import hum_score, offset_score
 from .record_level import hum_of, record_effects, remove_from_checks, remove_record_effect
 from .search import SECOND_Z, screened, search
-from .setup import Choices, effect_parameters, spectra_of, with_held_masses
+from .setup import Choices, spectra_of, with_held_masses
+from .task import Task
 from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
 
 RECORD_Z = 8.0
@@ -50,49 +50,47 @@ def diagnose(
     Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all.
     """
     bench = load_bench(bench)
-    say = progress or (lambda *a: None)
     recordings, check = list(recordings), list(check)
     choices = with_held_masses(choices, bench, actuator)
     if known := known_instruments(recordings, calibration, bench):
         return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
+    task = Task(tuple(recordings), bench, choices, progress, actuator)
+    task.say("between the harmonics")
     spectra = spectra_of(recordings, bench, choices.harmonics)
-    say("between the harmonics", 0, None)
     if alternation := alternating(recordings, spectra, bench.output):
         asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress}
         return alternation.told(diagnose(alternation.cleaned, bench, **asked))
-    held = effect_parameters(actuator)
     if problem := data_problem(recordings, spectra, bench.output):
-        base = fit(recordings, bench, actuator=actuator, extra=held, choices=choices, progress=progress, refine=False)
-        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=base)
+        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=task.fit(refine=False))
     adopted, cleaned = _record_level(recordings, spectra, bench, choices)
-    return _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress)
+    return _examined(task.on(recordings=tuple(cleaned)), task, adopted, check)
 
 
-def _examined(recordings, cleaned, adopted, bench, check, actuator, held, choices, progress, plain=None) -> Diagnosis:
-    """The diagnosis of recordings `cleaned` of the record-level effects `adopted`; `plain`: their fit, where it is known."""
-    if plain is None:
-        plain = fit(cleaned, bench, actuator=actuator, extra=held, choices=choices, progress=progress)
+def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
+    """The diagnosis of recordings without the record-level effects `adopted`; `measured`: the task with them as they came,
+    `plain`: a fit of theirs, where it is known."""
+    plain = task.fit() if plain is None else plain
     if problem := wrong_bench(plain):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
-    candidates = screened(plain, choices)
-    asked = bench, check, actuator, held, choices, progress
-    hummed = {"actuator": actuator, "extra": held, "choices": choices, "progress": progress}
-    if found := _hum_on_harmonics(cleaned, adopted, bench, plain, candidates, hummed):
-        return _examined(recordings, found[0], [*adopted, found[1]], *asked, plain=found[2])
-    plain, candidates, zero, rival = _sensor_zero(cleaned, bench, plain, candidates, actuator, held, choices, progress)
-    raw, free = plain, held if zero is None else (*held, "sensor.offset")
-    if adopted:  # what the plain model makes of the readings as they came
-        raw = fit(recordings, bench, actuator=actuator, extra=free, choices=plain.choices, progress=progress, refine=False)
-    checks = check, remove_from_checks(check, [e for e, _ in adopted], bench)
-    plain, candidates = _screened_finer(cleaned, bench, plain, candidates, choices, free, progress)
-    place = where(plain, candidates, cleaned, bench.output)
-    reached = search(cleaned, bench, plain, candidates, choices, progress, checks[1])
-    if reached.steps and (found := _hum_on_harmonics(cleaned, adopted, bench, reached.current, (), hummed)):
-        return _examined(recordings, found[0], [*adopted, found[1]], *asked)
+    candidates = screened(plain, task.choices)
+    if found := _hum_on_harmonics(task, adopted, plain, candidates):
+        cleaned, hum, freed = found
+        return _examined(cleaned, measured, [*adopted, hum], check, freed)
+    plain, candidates, zero, rival = _sensor_zero(task, plain, candidates)
+    free = task.held if zero is None else (*task.held, "sensor.offset")
+    raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
+    checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
+    plain, candidates = _screened_finer(task, plain, candidates, free)
+    place = where(plain, candidates, task.recordings, task.bench.output)
+    reached = search(task, plain, candidates, checks[1])
+    if reached.steps and (found := _hum_on_harmonics(task, adopted, reached.current)):
+        cleaned, hum, _ = found
+        return _examined(cleaned, measured, [*adopted, hum], check)
     evidence = Evidence(
-        reached, tuple(adopted), raw, plain, tuple(candidates), tuple(cleaned), bench, checks, _floors(plain), place, _absorbed(candidates, reached.tried)
+        reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
+        _absorbed(candidates, reached.tried),
     )  # fmt: skip
-    return _with_zero(_concluded(evidence, progress), zero, rival)
+    return _with_zero(_concluded(evidence, task.progress), zero, rival)
 
 
 def _concluded(evidence, progress) -> Diagnosis:
@@ -122,65 +120,61 @@ def _absorbed(candidates, tried) -> tuple[str, ...]:
     return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY)
 
 
-def _hum_on_harmonics(recordings, adopted, bench, base, candidates, asked):
+def _hum_on_harmonics(task, adopted, base, candidates=()):
     """Hum that falls on harmonics of the drive, where no repeat shows it: adopted if it scores above every effect and takes
-    most of what `base` leaves. Returns the recordings without it, the effect with its rivals, and their fit; None elsewhere.
+    most of what `base` leaves. Returns the task without it, the effect with its rivals, and its fit; None elsewhere.
     """
-    held = any(e.name == "mains_hum" for e, _ in adopted)
+    held, bench = any(e.name == "mains_hum" for e, _ in adopted), task.bench
     if held or bench.output != "displacement" or _quasistatic(bench) or not base.chi2_per_sample > SILENT_CHI2:
         return None
-    excess = chi2_of(base) - 0.92 * base.data_count
+    excess = excess_of(base)
     z, tones = hum_score(base.problem, base.refined)
     if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 for c in candidates)]):
         return None
     effect = hum_of(base.spectra, z, tones)
-    cleaned = remove_record_effect(recordings, effect, bench.output)
-    more = {"actuator": base.actuator, "extra": effect_parameters(base.actuator)}
-    freed = fit(cleaned, bench, **{**asked, **more})
+    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
+    freed = cleaned.fit(base.actuator)
     if chi2_of(freed) > chi2_of(base) - MOST_OF_IT * excess:
         return None
     return cleaned, (effect, []), freed
 
 
-def _sensor_zero(recordings, bench, base, candidates, actuator, held, choices, progress):
+def _sensor_zero(task, base, candidates):
     """A sensor whose zero is not the rod's rest: part of the base, if it scores above any effect and alone meets the noise.
 
     Returns the base, its candidates, the zero, m, or None, and the zero that would explain as much as the best effect, or None.
     """
-    as_it_is = base, candidates, None, None
+    as_it_is, bench = (base, candidates, None, None), task.bench
     if bench.output != "displacement" or bench.drive == "voltage" or "sensor.offset" in bench.free:
         return as_it_is
-    best, excess = max((c.z**2 for c in candidates), default=0.0), chi2_of(base) - 0.92 * base.data_count
+    best, excess = max((c.z**2 for c in candidates), default=0.0), excess_of(base)
     score = offset_score(base.problem, base.refined) ** 2
     tied = max(TIE, WEAK_TIE[0] * best)
     needed = min(best - tied, 0.5 * excess) if base.chi2_per_sample > FAR_ZERO else best - tied
     if score < max(Z_THRESHOLD**2, needed):
         return as_it_is
-    asked = {"actuator": actuator, "extra": (*held, "sensor.offset"), "progress": progress, "spectra": base.spectra}
-    freed = fit(recordings, bench, choices=base.choices, start=base, refine=False, **asked)
+    free = (*task.held, "sensor.offset")
+    freed = task.fit_on(base, extra=free, choices=base.choices)
     if chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
         return as_it_is
     if freed.chi2_per_sample > FINER_FROM[0]:  # the density was chosen under the misfit
-        freed = fit(recordings, bench, choices=choices, **asked)
+        freed = task.fit(extra=free, spectra=base.spectra)
     if freed.chi2_per_sample > SILENT_CHI2:
         return as_it_is
     zero = freed.estimate("sensor.offset").value
     if score < best + tied and base.chi2_per_sample < FAR_ZERO:
         return base, candidates, None, zero
-    return freed, screened(freed, choices), zero, None
+    return freed, screened(freed, task.choices), zero, None
 
 
-def _screened_finer(recordings, bench, base, candidates, choices, held, progress):
+def _screened_finer(task, base, candidates, free):
     """The base and its candidates; where none would take half of what is left, a finer density is given a chance first."""
     best = max((c.z**2 for c in candidates), default=0.0)
     meant = REFINE_BELOW <= base.chi2_per_sample < UNEXPLAINED and base.choices.knots is not None
     if not meant or best > 0.5 * (chi2_of(base) - base.data_count):
         return base, candidates
-    finer = fit(
-        recordings, bench, actuator=base.actuator, extra=held, choices=base.choices, start=base, refine=UNEXPLAINED, progress=progress,
-        spectra=base.spectra,
-    )  # fmt: skip
-    return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, choices))
+    finer = task.fit_on(base, base.actuator, extra=free, choices=base.choices, refine=UNEXPLAINED)
+    return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, task.choices))
 
 
 def _quasistatic(bench) -> bool:

@@ -11,10 +11,10 @@ import dataclasses
 from magjax.errors import ConfigurationError
 from magjax.scale import Chunk, Job, run_job
 
-from .fit import fit_or_stop as fit
 from .scale.bootstrap import model_lines, parametric_noise
 from .scale.refit import lean
 from .search import screened, search
+from .task import Task
 from .verdict import Z_THRESHOLD, too_little
 
 
@@ -59,10 +59,10 @@ def searched(inputs, number, rng) -> dict:
     lines = inputs["lines"] + parametric_noise(result.problem.target, rng)
     spectra = tuple(_reading(s, row) for s, row in zip(result.spectra, lines, strict=True))
     own = tuple(n for n in result.problem.layout.names if n not in result.bench.free)
-    asked = {"actuator": result.actuator, "extra": own, "choices": result.choices, "refine": False}
-    base = fit(recordings, result.bench, **asked, start=result, spectra=spectra)
+    task = Task(recordings, result.bench, result.choices, actuator=result.actuator)
+    base = task.fit_on(result, extra=own, spectra=spectra)
     candidates = screened(base, result.choices)
-    reached = search(recordings, result.bench, base, candidates, result.choices, None)
+    reached = search(task, base, candidates)
     named = [] if too_little(reached, base) else [best.name for best, *_ in reached.steps]
     return {"named": named, "highest_z": max((float(abs(c.z)) for c in candidates), default=0.0)}
 

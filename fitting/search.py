@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from magjax.effects import CATALOGUE, SensorLag
+from magjax.effects import SensorLag
 
 from .attribute import (
     BIC_DROP,
@@ -21,6 +21,7 @@ from .attribute import (
     Trial,
     chi2_of,
     credited,
+    excess_of,
     family,
     leaders,
     rivals_of,
@@ -29,12 +30,10 @@ from .attribute import (
 )
 from .check import check_errors
 from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, RESTS_IN_ORDER
-from .fit import fit_or_stop as fit
 from .instruments import RINGING, mode_as_filter
 from .screen import screen
-from .setup import effect_parameters
 from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, HALF, SILENT_CHI2, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, NULL_CHI2, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
@@ -61,12 +60,14 @@ class Reached:
     tried: dict
 
 
-def search(recordings, bench, base, candidates, choices, progress, check=()) -> Reached:
-    """Forward: fit the leaders, adopt the best while it earns its place; then screen again."""
-    count = base.data_count
+def search(task, base, candidates, check=()) -> Reached:
+    """Forward: fit the leaders, adopt the best while it earns its place; then screen again. `task`: a `Task`, of what
+    `base` was fitted to."""
     state = Reached(base, [], {})
     scored = {c.name: c for c in candidates}
-    chosen = base.choices  # the density chosen for the base may be finer than the default: rivals get the same
+    asked = task.choices
+    task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
+    any_rest = asked.rest == "auto"
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
         calm = state.steps and state.current.chi2_per_sample < SILENT_CHI2
@@ -74,58 +75,55 @@ def search(recordings, bench, base, candidates, choices, progress, check=()) -> 
             break
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
-        excess = max(chi2_of(state.current) - 0.92 * count, MIN_DROP)
-        trials = _trials((recordings, bench, state.current), top, candidates, chosen, excess, progress)
+        excess = max(excess_of(state.current), MIN_DROP)
+        trials = _trials(task, state.current, top, candidates, excess)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
         if not good:
             break
         best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
-        if state.steps and best.drop < LEAST_SHARE * excess and chi2_of(state.current) > MISFIT * count:
+        if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
             break
         further = state.steps and check and not _decides(state.current, best, excess)
-        if further and _predicts_worse(state.current, best.result, check, bench):
+        if further and _predicts_worse(state.current, best.result, check, task.bench):
             break
-        left = screened(best.result, choices)
+        left = screened(best.result, asked)
         if not state.steps and not _promises(best.result, left):
-            best, left = _of_two(recordings, bench, best, left, good, choices, chosen, progress)
-        asked = (recordings, bench, state.current, best, good, chosen, excess, progress)
-        best, good, chosen = _finer(*asked, choices.rest == "auto", not _promises(best.result, left))
+            best, left = _of_two(task, best, left, good)
+        found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(best.result, left))
+        candidates = left if found.result is best.result else screened(found.result, asked)
+        best = found
         state.steps.append((best, rivals_of(best, good), good, state.current))
-        candidates = left if best.result is asked[3].result else screened(best.result, choices)
         state.current = best.result
         let_go()
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
-        _backward(recordings, bench, state, chosen, count, progress)
-        _exchange(recordings, bench, state, chosen, progress)
-        if _commuted(recordings, bench, state, scored.get("sensor_lag"), chosen, progress):
-            _exchange(recordings, bench, state, chosen, progress)
+        _backward(task, state)
+        _exchange(task, state)
+        if _commuted(task, state, scored.get("sensor_lag")):
+            _exchange(task, state)
     return state
 
 
-def _trials(asked, top, candidates, chosen, excess, progress) -> list[Trial]:
-    """The leaders fitted, two side by side, until one meets the noise; then the family of the best.
-
-    `asked`: recordings, bench, and the fit beside which they are tried.
-    """
-    say = progress or (lambda *a: None)
-    classes = {c.name: c for c in CATALOGUE}
+def _trials(task, current, top, candidates, excess) -> list[Trial]:
+    """The leaders fitted beside the current fit, two side by side, until one meets the noise; then the family of the best."""
     trials = []
 
     def useful(*others):
         return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
 
     def begun(c, target):
-        return lambda say: try_effect(*asked, c, classes[c.name], chosen, excess, say, target)
+        return lambda say: try_effect(task.on(progress=say), current, c, excess, target)
 
     def ended(t, target):
-        return lambda say: settled(*asked, t, excess, say, target)
+        return lambda say: settled(task.on(progress=say), current, t, excess, target)
 
     def attempt(these):
-        say(f"trying {' and '.join(c.name for c in these)}", 0, asked[2].chi2_per_sample)
-        first = together([begun(c, useful()) for c in these], progress, lambda k, results: _needless(these[k], results.values()))
+        task.say(f"trying {' and '.join(c.name for c in these)}", current.chi2_per_sample)
+        first = together(
+            [begun(c, useful()) for c in these], task.progress, lambda k, results: _needless(these[k], results.values())
+        )
         first = [t for t in first if t is not None]
-        trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], progress))
+        trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], task.progress))
         let_go()
 
     while top:
@@ -138,10 +136,9 @@ def _trials(asked, top, candidates, chosen, excess, progress) -> list[Trial]:
     return trials
 
 
-def _to_the_end(recordings, bench, base, candidate, effect_class, choices, excess, progress):
+def _to_the_end(task, base, candidate, excess):
     """A trial, settled."""
-    trial = try_effect(recordings, bench, base, candidate, effect_class, choices, excess, progress)
-    return settled(recordings, bench, base, trial, excess, progress)
+    return settled(task, base, try_effect(task, base, candidate, excess), excess)
 
 
 def _needless(candidate, trials) -> bool:
@@ -164,32 +161,28 @@ def _predicts_worse(before, after, check, bench) -> bool:
     return new > 1.02 * old
 
 
-def _backward(recordings, bench, state, chosen, count, progress):
+def _backward(task, state):
     """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open.
 
     The form error of a right effect looks like another effect until the rest is in place.
     """
-    say = progress or (lambda *a: None)
     for step in state.steps[:-1][::-1]:
         name = step[0].name
         actuator = state.current.actuator
         if name not in {e.name for e in actuator.effects}:
             continue
-        say(f"without {name}", 0, state.current.chi2_per_sample)
-        fewer = actuator.without_effect(name)
-        most = max(chi2_of(state.current) + MIN_DROP, 2 * chi2_of(state.current) - 0.95 * count)
-        more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra, "start": state.current}
-        trial = fit(recordings, bench, actuator=fewer, extra=effect_parameters(fewer), target=most, **more)
+        task.say(f"without {name}", state.current.chi2_per_sample)
+        most = max(chi2_of(state.current) + MIN_DROP, chi2_of(state.current) + excess_of(state.current, NULL_CHI2))
+        trial = task.fit_on(state.current, actuator.without_effect(name), target=most)
         rise = chi2_of(trial) - chi2_of(state.current)
-        if rise < max(MIN_DROP, 0.5 * (chi2_of(trial) - 0.95 * count)):
+        if rise < max(MIN_DROP, HALF * excess_of(trial, NULL_CHI2)):
             state.steps.remove(step)
             state.current = trial
 
 
-def _exchange(recordings, bench, state, chosen, progress):
+def _exchange(task, state):
     """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
     that was not theirs."""
-    classes = {c.name: c for c in CATALOGUE}
     for index, (best, _, good, previous) in enumerate(state.steps[:-1]):
         near = [t for t in good if t is not best and t.bic_change < best.bic_change + NEAR_RIVAL * chi2_of(best.result)]
         if not near or best.name not in {e.name for e in state.current.actuator.effects}:
@@ -208,9 +201,9 @@ def _exchange(recordings, bench, state, chosen, progress):
         near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
 
         def beside(t, rest=rest):
-            return lambda say: _to_the_end(recordings, bench, rest, t.candidate, classes[t.name], chosen, MIN_DROP, say)
+            return lambda say: _to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP)
 
-        for t, trial in zip(near, together([beside(t) for t in near], progress), strict=True):
+        for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
             trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
         trials = [t for t in trials if t.physical]
         found = min(trials, key=lambda t: t.bic_change)
@@ -218,7 +211,7 @@ def _exchange(recordings, bench, state, chosen, progress):
         state.current = found.result
 
 
-def _commuted(recordings, bench, state, candidate, chosen, progress) -> bool:
+def _commuted(task, state, candidate) -> bool:
     """A second mode of the rod may be the rod itself, and what passed for the rod a filter in its sensor: linear filters commute.
 
     Tried from where the two have changed places, which no fit from the base's optimum reaches. Whether the filter was adopted.
@@ -227,21 +220,19 @@ def _commuted(recordings, bench, state, candidate, chosen, progress) -> bool:
     names, held = ("mechanics.f0", "mechanics.xi"), {e.name for e in state.current.actuator.effects}
     if index is None or candidate is None or "second_mode" not in held or "sensor_lag" in held:
         return False
-    if set(names) & set(bench.priors) or not set(names) <= set(bench.free):
+    if set(names) & set(task.bench.priors) or not set(names) <= set(task.bench.free):
         return False
     estimate = state.current.estimate
     modes = [tuple(estimate(n).value for n in names), tuple(estimate(f"effects.second_mode.{n}").value for n in ("f2", "xi2"))]
     rod, sensor = sorted(modes, key=lambda mode: mode[1])
     if sensor[1] < RINGING:
         return False
-    if progress is not None:
-        progress("a filter in the sensor in place of a second mode", 0, state.current.chi2_per_sample)
+    task.say("a filter in the sensor in place of a second mode", state.current.chi2_per_sample)
     actuator = state.current.actuator.without_effect("second_mode").replace(dict(zip(names, rod, strict=True)))
     actuator = actuator.with_effect(SensorLag(*mode_as_filter(*sensor)))
-    more = {"choices": chosen, "refine": False, "progress": progress, "spectra": state.current.spectra, "start": state.current}
-    result = fit(recordings, bench, actuator=actuator, extra=effect_parameters(actuator), **more)
+    result = task.fit_on(state.current, actuator)
     best, rivals, _, previous = state.steps[index]
-    excess = max(chi2_of(previous) - 0.92 * result.data_count, MIN_DROP)
+    excess = max(excess_of(previous), MIN_DROP)
     own, swapped = (
         credited(c, r, previous, r.actuator.effect(c.name), excess)
         for c, r in ((best.candidate, state.current), (candidate, result))
@@ -255,14 +246,10 @@ def _commuted(recordings, bench, state, candidate, chosen, progress) -> bool:
 
 def _promises(result, candidates) -> bool:
     """Whether a further effect promises more than half of a misfit: then the density waits, for a finer one would take it up."""
-    return bool(candidates) and result.chi2_per_sample > FAR_BESIDE and candidates[0].z ** 2 > HALF * _left_by(result)
+    return bool(candidates) and result.chi2_per_sample > FAR_BESIDE and candidates[0].z ** 2 > HALF * excess_of(result)
 
 
-def _left_by(result) -> float:
-    return chi2_of(result) - 0.92 * result.data_count
-
-
-def _of_two(recordings, bench, best, left, good, choices, chosen, progress):
+def _of_two(task, best, left, good):
     """The best and the scores beside it; or a rival's, with which a further effect explains what the best leaves.
 
     One effect with shapes of its own imitates two others better than either of them alone.
@@ -277,45 +264,43 @@ def _of_two(recordings, bench, best, left, good, choices, chosen, progress):
         if any(abs(chi2_of(t.result) / chi2_of(rival.result) - 1) < ALIKE for t in tried):  # of one family
             continue
         tried.append(rival)
-        scores = screened(rival.result, choices)
-        first, excess = scores[0], _left_by(rival.result)
+        scores = screened(rival.result, task.choices)
+        first, excess = scores[0], excess_of(rival.result)
         if first.z**2 < HALF * excess or chi2_of(rival.result) - first.z**2 > chi2_of(best.result) - MIN_DROP:
             continue
-        classes = {c.name: c for c in CATALOGUE}
-        pair = _to_the_end(recordings, bench, rival.result, first, classes[first.name], chosen, excess, progress)
+        pair = _to_the_end(task, rival.result, first, excess)
         cost = (rival.parameters + pair.parameters - best.parameters) * np.log(pair.result.data_count)
         met = pair.physical and pair.result.chi2_per_sample < MISFIT
-        if met and chi2_of(pair.result) + cost < chi2_of(best.result) - max(BIC_DROP, HALF * _left_by(best.result)):
+        if met and chi2_of(pair.result) + cost < chi2_of(best.result) - max(BIC_DROP, HALF * excess_of(best.result)):
             return rival, scores
     return best, left
 
 
-def _finer(recordings, bench, current, best, good, chosen, excess, progress, any_rest: bool = True, any_density: bool = True):
+def _finer(task, current, best, good, excess, any_rest: bool = True, any_density: bool = True):
     """The best with another start memory and with a finer density where it still leaves something: both were chosen under
-    the misfit of the base. Where that changes them, the near rivals are tried again on the same.
+    the misfit of the base. Where that changes them, the near rivals are tried again on the same. Returns the best, the
+    trials beside it, and the task with what was chosen.
 
     Start memories that serve as well foretell other mean levels: the one that is tried first stands unless another is
     better by MIN_DROP.
     """
-    names = tuple(e.name for e in best.result.estimates if e.name.startswith("effects."))
-    more = {"actuator": best.result.actuator, "extra": names, "progress": progress, "spectra": best.result.spectra}
-    found = chosen
+    found = chosen = task.choices
     later = chosen.rest != RESTS_IN_ORDER[0]
-    if any_rest and bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
+    if any_rest and task.bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
         free = dataclasses.replace(chosen, rest="auto")
-        other = fit(recordings, bench, choices=free, refine=False, start=best.result, **more)
+        other = task.fit_on(best.result, best.result.actuator, choices=free)
         margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
         if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices
     if any_density and chosen.knots is not None and FINER_FROM[0] < best.result.chi2_per_sample < REFINE_BESIDE:
-        found = fit(recordings, bench, choices=found, refine=True, **more).choices
+        found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra).choices
     if found == chosen:
-        return best, good, chosen
-    classes = {c.name: c for c in CATALOGUE}
+        return best, good, task
+    task = task.on(choices=found)
     near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
 
     def anew(t):
-        return lambda say: _to_the_end(recordings, bench, current, t.candidate, classes[t.name], found, excess, say)
+        return lambda say: _to_the_end(task.on(progress=say), current, t.candidate, excess)
 
-    again = [t for t in together([anew(t) for t in near], progress) if t.physical] or [best]
-    return min(again, key=lambda t: t.bic_change), again, found
+    again = [t for t in together([anew(t) for t in near], task.progress) if t.physical] or [best]
+    return min(again, key=lambda t: t.bic_change), again, task

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from magjax.effects import CATALOGUE
+from magjax.effects import CLASSES
 
 from .attribute import MISFIT, chi2_of, confidence
 from .check import check_errors
@@ -311,7 +311,7 @@ def _sizes(name, result) -> dict:
 
 
 def _record_row(effect) -> dict:
-    kind = {c.name: c for c in CATALOGUE}[effect.name]
+    kind = CLASSES[effect.name]
     info = kind.parameters()[kind.amplitude]
     return {
         "name": effect.name, "block": kind.block,

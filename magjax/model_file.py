@@ -27,7 +27,7 @@ def load_model(folder):
 
 
 def _model(content):
-    from .effects import CATALOGUE
+    from .effects import CLASSES
     from .effects.learned_term import LearnedTerm
 
     stated = dict(content["bench"])
@@ -41,8 +41,7 @@ def _model(content):
     hysteresis = Preisach(np.asarray(plane["masses"]), plane["low"], plane["high"], plane["offset"], rest=plane.get("rest"))
     hysteresis = eqx.tree_at(lambda h: h.history, hysteresis, jnp.asarray(plane["history"], dtype=float))
     actuator = eqx.tree_at(lambda a: a.hysteresis, actuator, hysteresis)
-    classes = {e.name: e for e in CATALOGUE}
     for name in content["effects"]:
-        effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else classes[name]()
+        effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else CLASSES[name]()
         actuator = actuator.with_effect(effect)
     return actuator.replace(content["parameters"]), bench

@@ -10,8 +10,9 @@ from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rival
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
+from fitting.task import Task
 from fitting.verdict import too_little
-from magjax.effects import CATALOGUE
+from magjax.effects import CLASSES
 
 COUNT = 700
 
@@ -104,15 +105,16 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     best = trial("second_mode", 1.0)
     best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
-    monkeypatch.setattr(module, "fit", lambda *a, choices, **k: other if choices.rest == "auto" else pytest.fail("not asked"))
+    fit = lambda *a, choices, **k: other if choices.rest == "auto" else pytest.fail("not asked")
+    monkeypatch.setattr("fitting.task.fit_or_stop", fit)
     again = []
-    monkeypatch.setattr(module, "try_effect", lambda *a: again.append(a[5].rest) or best)
-    bench = load_bench("aa-050h")
-    assert bench.start == "auto"
-    *_, chosen = module._finer(None, bench, None, best, [best], Choices(rest=held), 1.0, None)
-    assert chosen.rest == (found if taken else held) and again == ([found] if taken else [])
-    fixed = module._finer(None, bench, None, best, [best], Choices(rest=held), 1.0, None, any_rest=False)
-    assert fixed[2].rest == held
+    monkeypatch.setattr(module, "try_effect", lambda task, *a: again.append(task.choices.rest) or best)
+    task = Task((), load_bench("aa-050h"), Choices(rest=held))
+    assert task.bench.start == "auto"
+    *_, asked = module._finer(task, None, best, [best], 1.0)
+    assert asked.choices.rest == (found if taken else held) and again == ([found] if taken else [])
+    *_, fixed = module._finer(task, None, best, [best], 1.0, any_rest=False)
+    assert fixed.choices.rest == held
 
 
 @pytest.mark.parametrize(
@@ -156,7 +158,7 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
     """One far beyond what is typical imitates another law; a share that has reached its bound may run on."""
     from fitting.attribute import _physical
 
-    effect = {c.name: c for c in CATALOGUE}[name]()
+    effect = CLASSES[name]()
     result = SimpleNamespace(estimate=lambda parameter: SimpleNamespace(value=amplitude))
     assert _physical(effect, result) == physical
 

@@ -9,7 +9,7 @@ import pytest
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from magjax.bench import load_bench
-from magjax.effects import CATALOGUE
+from magjax.effects import CLASSES
 
 DRIVES = (
     (10, 0.8, 0.1),
@@ -22,7 +22,6 @@ DRIVES = (
     (250, 0.5, -0.2),
     (300, 0.8, 0.1),
 )
-CLASSES = {c.name: c for c in CATALOGUE}
 CASES = [
     ("excess_loss", {"k": 30.0, "rate_knee": 5.0}, False),
     ("coulomb_friction", {"f": 8e-8, "v_s": 1e-4}, True),

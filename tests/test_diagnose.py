@@ -15,6 +15,7 @@ from fitting.floors import data_problem
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
+from fitting.task import Task
 from fitting.verdict import Evidence, _achieved, _found
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
@@ -115,10 +116,10 @@ def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(mo
     rounds = iter([[trial("creep", fits[1], 1100.0), trial("backlash", fits[1], 900.0)], [trial("backlash", fits[2], 100.0)], []])
     for name, made in {
         "leaders": lambda candidates: candidates, "_trials": lambda *a: next(rounds), "screened": lambda *a: [scored("backlash", 20.0)],
-        "_finer": lambda r, b, now, best, good, *a: (best, good, None), "_backward": lambda *a: None, "_exchange": lambda *a: None,
+        "_finer": lambda task, now, best, good, *a: (best, good, task), "_backward": lambda *a: None, "_exchange": lambda *a: None,
     }.items():  # fmt: skip
         monkeypatch.setattr(search_module, name, made)
-    reached = search_module.search([], None, fits[0], [scored("creep", 40.0)], Choices(), None)
+    reached = search_module.search(Task((), None), fits[0], [scored("creep", 40.0)])
     assert [best.name for best, *_ in reached.steps] == ["creep", "backlash"]
     assert reached.tried["backlash"].achieved_chi2_drop == 900.0
 

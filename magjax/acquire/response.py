@@ -128,12 +128,11 @@ class BenchResponse:
 
 def effect_of(name: str, parameters: dict):
     """An effect of the catalogue by name; raises `ConfigurationError` naming what there is."""
-    from ..effects import CATALOGUE
+    from ..effects import CLASSES
 
-    classes = {e.name: e for e in CATALOGUE}
-    if name not in classes:
-        raise ConfigurationError(f'no effect "{name}"; the catalogue has {", ".join(classes)}')
-    known = classes[name].parameters()
+    if name not in CLASSES:
+        raise ConfigurationError(f'no effect "{name}"; the catalogue has {", ".join(CLASSES)}')
+    known = CLASSES[name].parameters()
     for key, value in parameters.items():
         if key not in known:
             raise ConfigurationError(f'effect {name} has no parameter "{key}"; it has {", ".join(known)}')
@@ -141,8 +140,8 @@ def effect_of(name: str, parameters: dict):
             raise ConfigurationError(
                 f"effect {name}: {key} = {value:g}; give {known[key].low:g} to {known[key].high:g} {known[key].unit}"
             )
-    amplitude = classes[name].amplitude
+    amplitude = CLASSES[name].amplitude
     if amplitude not in parameters:
         typical = known[amplitude].typical or (known[amplitude].scale,) * 2
         parameters = {amplitude: float(np.sqrt(abs(typical[0] * typical[1]))), **parameters}
-    return classes[name](**parameters)
+    return CLASSES[name](**parameters)

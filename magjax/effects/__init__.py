@@ -63,4 +63,6 @@ CATALOGUE = (
     ZeroDrift,
 )
 
-__all__ = ["CATALOGUE", "AbstractEffect", "Trial"]
+CLASSES = {effect.name: effect for effect in CATALOGUE}
+
+__all__ = ["CATALOGUE", "CLASSES", "AbstractEffect", "Trial"]
