@@ -1,5 +1,6 @@
 """`python -m tests.benchmarks.run [NAME ...]`: every ratio of the README's table, in one run, kept in results.json."""
 
+import argparse
 import json
 import os
 import resource
@@ -267,7 +268,11 @@ GROUPS = {
 
 def main():
     """Run the groups named, or all; print and keep."""
-    names = sys.argv[1:] or list(GROUPS)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("groups", nargs="*", metavar="GROUP", help=f"{', '.join(GROUPS)} (default all)")
+    names = parser.parse_args().groups or list(GROUPS)
+    if unknown := [name for name in names if name not in GROUPS]:
+        parser.error(f"no group {', '.join(unknown)}; there are {', '.join(GROUPS)}")
     if len(names) > 1:  # each in a process of its own: the peak memory of one would hide what another needs
         for name in names:
             subprocess.run([sys.executable, "-m", "tests.benchmarks.run", name], check=True)

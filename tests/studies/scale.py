@@ -62,11 +62,16 @@ def timed(name, work, executors, runs=("first", "second")):
                 "numbers": digest(numbers),
             }  # fmt: skip
             print(name, label, run, row[run], flush=True)
-    first = next(iter(rows.values()))[runs[-1]]
+    return rows
+
+
+def compared(rows, run="second"):
+    """The rows with their gain over the first."""
+    first = next(iter(rows.values()))[run]
     for row in rows.values():
-        row["identical"] = all(row[r]["numbers"] == first["numbers"] for r in runs)
-        row["speed_up"] = round(first["seconds"] / row[runs[-1]]["seconds"], 2)
-        row["speed_up_after_the_first_chunk"] = round(row[runs[-1]]["chunks_per_s_after_it"] / first["chunks_per_s_after_it"], 2)
+        row["identical"] = all(row[r]["numbers"] == first["numbers"] for r in row)
+        row["speed_up"] = round(first["seconds"] / row[run]["seconds"], 2)
+        row["speed_up_after_the_first_chunk"] = round(row[run]["chunks_per_s_after_it"] / first["chunks_per_s_after_it"], 2)
     return rows
 
 
@@ -245,6 +250,7 @@ PARTS = ("workers", "killed", "batch", "costs")
 
 def main():
     """Run the parts asked for and write them into scale.json; the others stay."""
+    import dask
     import distributed
 
     p = argparse.ArgumentParser(description=__doc__)
@@ -264,9 +270,14 @@ def main():
         for recording in recordings:
             write_recording(folder / recording.name, recording)
         executors = {"this process": None, "1 process": "processes:1", "2 processes": "processes:2"}
-        if {"workers", "costs"} & set(parts):
+
+        def with_dask():
+            """The same on a dask cluster of this machine; up for these rows alone, for its processes are never quite idle. The
+            environment that dask gives its workers (one OpenMP thread, memory handed back at every turn) halves their speed."""
+            stack.enter_context(dask.config.set({"distributed.nanny.pre-spawn-environ": {"OPENBLAS_NUM_THREADS": "1"}}))
             cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
-            executors["dask, 2 workers"] = f"dask:{stack.enter_context(cluster).scheduler_address}"
+            return {"dask, 2 workers": f"dask:{stack.enter_context(cluster).scheduler_address}"}
+
         if "batch" in parts:
             content["batch"] = batch(result)
         if "workers" in parts:
@@ -278,10 +289,14 @@ def main():
             def drawn(count):
                 return lambda executor, progress: bootstrap_intervals(result, count, executor=executor, progress=progress).draws
 
-            content["sweep 200 x 20"] = timed("sweep", swept, executors)
-            content["bootstrap of 200"] = timed("bootstrap", drawn(200), executors)
             fewer = {k: v for k, v in executors.items() if k != "1 process"}
-            content["bootstrap of 1000"] = timed("long bootstrap", drawn(1000), fewer, ("second",))
+            jobs = {
+                "sweep 200 x 20": ("sweep", swept, executors), "bootstrap of 200": ("bootstrap", drawn(200), executors),
+                "bootstrap of 1000": ("long bootstrap", drawn(1000), fewer, ("second",)),
+            }  # fmt: skip
+            rows, up = {key: timed(*job) for key, job in jobs.items()}, with_dask()
+            for key, (name, work, _, *runs) in jobs.items():
+                content[key] = compared(rows[key] | timed(name, work, up, *runs))
         if "killed" in parts:
             for name in ("bootstrap", "sweep"):
                 (folder / name).mkdir()
@@ -290,7 +305,7 @@ def main():
                 "bootstrap": killed(folder / "bootstrap", *bootstrap_command(folder), 5, (5, 12)),
             }
         if "costs" in parts:
-            content["costs"] = costs(result, recordings, folder, executors)
+            content["costs"] = costs(result, recordings, folder, executors | with_dask())
     options.out.write_text(json.dumps(content, indent=1) + "\n")
 
 
