@@ -234,15 +234,16 @@ def test_a_sensors_zero_is_adopted_where_it_scores_best_and_told_of_where_an_eff
         record(truth, *drive, rng, f"r{drive[0]}") for drive in ((10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0))
     ]
     runs = [dataclasses.replace(r, channels={**r.channels, "displacement": r.channels["displacement"] + zero}) for r in runs]
-    base = module.fit(runs, bench, refine=False)
+    task = Task(tuple(runs), bench)
+    base = task.fit(refine=False)
     monkeypatch.setattr(module, "screened", lambda result, choices: [])
-    asked = (None, (), base.choices, None)
+    task = task.on(choices=base.choices)
     score = abs(module.offset_score(base.problem, base.refined))
     assert score > 8
     rival = SimpleNamespace(z=1.02 * score)
-    same, candidates, none, told = module._sensor_zero(runs, bench, base, [rival], *asked)
+    same, candidates, none, told = module._sensor_zero(task, base, [rival])
     assert same is base and candidates == [rival] and none is None and told == pytest.approx(zero, abs=1.2e-6)
-    freed, _, found, none = module._sensor_zero(runs, bench, base, [SimpleNamespace(z=0.5 * score)], *asked)
+    freed, _, found, none = module._sensor_zero(task, base, [SimpleNamespace(z=0.5 * score)])
     assert found == pytest.approx(zero, abs=1.2e-6) and none is None and freed.chi2_per_sample < base.chi2_per_sample
-    better = module._sensor_zero(runs, bench, base, [SimpleNamespace(z=2 * score)], *asked)
+    better = module._sensor_zero(task, base, [SimpleNamespace(z=2 * score)])
     assert better[0] is base and better[2:] == (None, None)
