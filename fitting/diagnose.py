@@ -18,7 +18,7 @@ from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term
 from .locate import where
 from .on_lines import hum_score, offset_score
-from .record_level import hum_of, record_effects, remove_from_checks, remove_record_effect
+from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect
 from .search import SECOND_Z, screened, search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
@@ -129,7 +129,7 @@ def _hum_on_harmonics(task, adopted, base, candidates=()):
         return None
     excess = excess_of(base)
     z, tones = hum_score(base.problem, base.refined)
-    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 for c in candidates)]):
+    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 for c in candidates)]) or not hum_is_seen(base.spectra, tones):
         return None
     effect = hum_of(base.spectra, z, tones)
     cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))

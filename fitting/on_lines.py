@@ -11,6 +11,8 @@ from .model import whitened
 from .record_level import HUM_TONES, MAINS
 from .screen import Projector
 
+SAME_SIZE = 0.8  # of what tones of any size in each recording would take, that those of one size must
+
 
 def offset_score(problem, solution) -> float:
     """z of a constant added to every reading, beside everything the base can do."""
@@ -20,10 +22,11 @@ def offset_score(problem, solution) -> float:
 
 
 def hum_score(problem, solution):
-    """Hum where it falls on harmonics of the drive, a phase of its own in each recording, beside everything the base can do.
+    """Hum where it falls on harmonics of the drive, beside everything the base can do: each tone has one amplitude, and a
+    phase of its own in each recording. What a rough density leaves there, or a single recording, has no size in common.
 
     Returns, of the mains frequency that explains more: the score z, of the same scale as one column's, and its tones
-    (frequency, Hz, and largest amplitude over the recordings); (0, ()) where no harmonic falls on one.
+    (frequency, Hz, and amplitude); (0, ()) where no harmonic falls on one, or sizes differ.
     """
     projector = Projector(problem, solution)
     best = 0.0, ()
@@ -33,13 +36,17 @@ def hum_score(problem, solution):
             continue
         columns = _projected(problem, projector, [(n, h, part) for n, h, _ in places for part in (1.0, 1j)])
         size, *_ = np.linalg.lstsq(columns, -projector.residual, rcond=1e-6)
-        fall = float(projector.residual @ projector.residual - np.sum((projector.residual + columns @ size) ** 2))
-        z = float(np.sqrt(max(fall - len(size), 0.0)))
-        if z > best[0]:
-            amplitudes = 2 * np.hypot(size[::2], size[1::2])
-            orders = np.asarray([k for _, _, k in places])
-            tones = ((k * mains, float(max(amplitudes[orders == k], default=0.0))) for k in range(1, HUM_TONES + 1))
-            best = z, tuple(tones)
+        phases = size.reshape(-1, 2) / np.maximum(np.hypot(size[::2], size[1::2]), 1e-300)[:, None]
+        orders = np.asarray([k for _, _, k in places])
+        own = np.stack([columns @ (phases * (orders == k)[:, None]).ravel() for k in range(1, HUM_TONES + 1)], axis=1)
+        alike, *_ = np.linalg.lstsq(own, -projector.residual, rcond=1e-6)
+        free, fall = (
+            float(projector.residual @ projector.residual - np.sum((projector.residual + x) ** 2))
+            for x in (columns @ size, own @ alike)
+        )
+        z = float(np.sqrt(max(fall - len(size) / 2, 0.0)))
+        if z > best[0] and fall > SAME_SIZE * free:
+            best = z, tuple((k * mains, 2 * float(a)) for k, a in enumerate(alike, 1))
     return best
 
 

@@ -13,6 +13,7 @@ from .spectra import fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
+CLEAR_HUM, LEAST_HUM = 25.0, 0.25  # chi2 that hum of a size would take between the harmonics, and the share that must show
 OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record by itself, and the share of records that must show it
 
 
@@ -72,6 +73,19 @@ def hum_of(spectra, z: float, tones) -> RecordEffect:
     both = tuple((f, max(a, b)) for (f, a), (_, b) in zip(tones, shown, strict=True))
     z = float(np.hypot(z, between))
     return RecordEffect("mains_hum", z, both[0][1], both[0][1] / max(z, 1.0), {"f": tones[0][0], "tones": both}, tuple(fits))
+
+
+def hum_is_seen(spectra, tones) -> bool:
+    """Whether hum of these tones (frequency, Hz, and amplitude) shows between the harmonics of recordings where it must."""
+    fall = promised = 0.0
+    for s in spectra:
+        parts, kinds = _tones(s, [f for f, _ in tones])
+        if not parts or s.samples * s.dt < 2 / tones[0][0]:
+            continue
+        fall += _combination([reduced for _, reduced in parts])[1] - len(parts)
+        power = [np.sum(weight * np.abs(c) ** 2) for _, (weight, _, c) in parts]
+        promised += float(np.sum(np.square([tones[k][1] for k in kinds]) * power) / 2)
+    return promised < CLEAR_HUM or fall > LEAST_HUM * promised
 
 
 def drift_of(s):

@@ -9,7 +9,8 @@ from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.fit import fit
 from fitting.on_lines import hum_score
-from fitting.setup import Choices
+from fitting.record_level import hum_is_seen
+from fitting.setup import Choices, spectra_of
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 
@@ -18,12 +19,13 @@ DRIVES = ((10, 0.8, 0.1), (25, 0.5, -0.2), (50, 0.6, 0.1), (100, 0.5, -0.1), (17
 HUM = 9e-8
 
 
-def recorded(hum=0.0):
+def recorded(hum=0.0, drives=DRIVES, only=None):
+    """Recordings with hum at 50 Hz, in that of one frequency `only` where it is given."""
     rng = np.random.default_rng(5)
     truth, rows = concealed_actuator(BENCH), []
-    for f, amplitude, offset in DRIVES:
+    for f, amplitude, offset in drives:
         row = record(truth, f, amplitude, offset, rng, f"{f} Hz")
-        wave = hum * np.sin(2 * np.pi * 50.0 * row.time + rng.uniform(0, 2 * np.pi))
+        wave = (hum if only in (None, f) else 0.0) * np.sin(2 * np.pi * 50.0 * row.time + rng.uniform(0, 2 * np.pi))
         rows.append(dataclasses.replace(row, channels={**row.channels, "displacement": row.channels["displacement"] + wave}))
     return rows
 
@@ -38,6 +40,20 @@ def test_hum_scores_on_the_harmonics_that_it_falls_on():
     base = fit(recorded(HUM), BENCH, refine=False)
     z, tones = hum_score(base.problem, base.refined)
     assert z > 15 and tones[0] == (50.0, pytest.approx(HUM, rel=0.3))
+
+
+def test_what_one_recording_shows_alone_is_no_hum():
+    """It would have the same size in all of them."""
+    base = fit(recorded(2 * HUM, only=25), BENCH, refine=False)
+    assert hum_score(base.problem, base.refined) == (0.0, ())
+
+
+def test_hum_must_show_between_the_harmonics_where_it_can():
+    tones = ((50.0, HUM), (100.0, 0.0), (150.0, 0.0))
+    off, on = (30, 0.8, 0.1), (50, 0.6, 0.1)
+    assert not hum_is_seen(spectra_of(recorded(drives=(off, on)), BENCH), tones)
+    assert hum_is_seen(spectra_of(recorded(HUM, (off, on)), BENCH), tones)
+    assert hum_is_seen(spectra_of(recorded(drives=(on,)), BENCH), tones)  # it cannot show
 
 
 @pytest.mark.long

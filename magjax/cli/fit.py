@@ -41,7 +41,7 @@ def _common(command, text, example, recordings="+"):
     p.add_argument(
         "--model", help="constants and effects to start from: a fitted result folder (its masses too, where the bench holds them)"
     )
-    p.add_argument("--check", nargs="+", default=[], help="recordings to predict that take no part in the fit")
+    p.add_argument("--check", nargs="+", action="extend", default=[], help="recordings to predict that take no part in the fit")
     p.add_argument("--out", help="folder for the results and the report")
     p.add_argument("--max-jacobians", type=int, default=30, help="limit of the iteration (default 30)")
     return p
@@ -121,7 +121,11 @@ def run_diagnose(arguments) -> int:
     p = _common("diagnose", "Say what physics the model leaves out: where, what, how much better with it, what to record next.",
                 "magjax diagnose rec_*.csv --bench aa-050h --check check_*.csv --out result")  # fmt: skip
     p.add_argument(
-        "--calibration", nargs="+", default=[], help="the sensor moved by a known amount: files with reference_m beside the reading"
+        "--calibration",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="the sensor moved by a known amount: files with reference_m beside the reading",
     )
     p.add_argument("--placebo", type=int, default=0, metavar="N",
                    help="search N simulations of the final model for what they do not lack: how often the search cries wolf (some seconds each, more where the screening alarms)")  # fmt: skip

@@ -24,7 +24,9 @@ def add_intervals(p) -> None:
         help="noise from its model, or from the recorded periods",
     )
     p.add_argument("--profile", metavar="NAMES", help="profile-likelihood intervals: R_eddy,xi or all")
-    p.add_argument("--fleet", nargs="+", metavar="DIR", help="one fit a folder of recordings; a table of all in --out")
+    p.add_argument(
+        "--fleet", nargs="+", action="extend", metavar="DIR", help="one fit a folder of recordings; a table of all in --out"
+    )
     add_where(p, f"what the bootstrap or the fleet has done (the profile beside it, FILE{PROFILE})")
 
 
