@@ -222,7 +222,8 @@ def _rough(evidence, checks) -> bool:
         return max((abs(c.z) for c in evidence.candidates), default=0.0) < SECOND_Z
     if too_little(evidence.reached, evidence.plain):
         return True
-    finer = current.choices.knots is not None and current.choices.knots[0] > Choices().knots[0]
+    choices = current.choices
+    finer = choices.knots[0] > Choices().knots[0] if choices.knots is not None else choices.rest != "held"
     if not checks:
         return finer and evidence.share > FULL_SHARE
     before, after = ([misfit([row], which) for row in checks] for which in ("rms_before", "rms_after"))

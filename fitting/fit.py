@@ -17,7 +17,9 @@ from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_para
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
-FINER_KNOTS = ((26, 18), (36, 24))
+FINER_HATS = ({"knots": (26, 18), "level": 104},)
+CELLS = tuple({"knots": None, "level": level} for level in (32, 40))  # a mass a cell: a rough density may need them
+FINEST_HATS = ({"knots": (36, 24), "level": 144},)  # where the field is known loops are steep, and cells too wide
 FINER_FROM = (1.05, 1.5)  # chi2/N from which each is tried,
 FINER_TAKES = (0.7, 0.5)  # and the share of the excess that it may leave
 REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
@@ -158,29 +160,47 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
 
 
 def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report, highest):
-    """Finer hats where chi2 stays above the noise, chi2/N below `highest`, and they lower it clearly."""
+    """A finer density where chi2 stays above the noise, chi2/N below `highest`, and it lowers it clearly."""
     count = problem.data_count
-    for knots, least, takes in zip(FINER_KNOTS, FINER_FROM, FINER_TAKES, strict=True):
-        if choices.knots[0] >= knots[0]:
+    for densities, least, takes in zip(finer_than(choices, bench), FINER_FROM, FINER_TAKES, strict=True):
+        if not densities or not least < solution.chi2 / count < highest:
             continue
-        if not least < solution.chi2 / count < highest:
-            break
-        finer = dataclasses.replace(choices, knots=knots, level=max(choices.level, 4 * knots[0]))
-        started = _resample(problem, solution, spectra, actuator, bench, names, finer)
-        trial_problem, z = started
-        z = _with_parameters(trial_problem, z, problem, solution)
         # a finer density must take its share of the excess, and five standard deviations
         target = min(0.95 * count + takes * max(solution.chi2 - 0.95 * count, 0.0), solution.chi2 - 25)
-        trial = solve(
-            trial_problem, z, solution.weights, max_jacobians=choices.max_jacobians, target=target,
-            progress=lambda k, c: report("finer density", k, c),
-        )  # fmt: skip
-        if trial.interrupted:
+
+        def tried(finer, known=problem, before=solution, target=target):
+            return lambda say: _on_density(known, before, actuator, bench, names, finer, spectra, target, say)
+
+        try:
+            trials = together([tried(finer) for finer in densities], report)
+        except KeyboardInterrupt:
             return problem, dataclasses.replace(solution, interrupted=True), choices
-        if not trial.chi2 < target:
-            break
-        problem, solution, choices = trial_problem, trial, finer
+        trial_problem, trial, finer = min(trials, key=lambda t: t[1].chi2)
+        if trial.chi2 < target:
+            problem, solution, choices = trial_problem, trial, finer
     return problem, solution, choices
+
+
+def _on_density(problem, solution, actuator, bench, names, finer, spectra, target, report):
+    """The fit with a finer density, from where that with the coarser one ended: (problem, solution, its choices)."""
+    found, z = _resample(problem, solution, spectra, actuator, bench, names, finer)
+    z = _with_parameters(found, z, problem, solution)
+    weights = np.asarray(found.target.weights) if finer.knots is None else solution.weights  # of another basis
+    trial = solve(
+        found, z, weights, max_jacobians=finer.max_jacobians, target=target, progress=lambda k, c: report("finer density", k, c)
+    )
+    if trial.interrupted:
+        raise KeyboardInterrupt
+    return found, trial, finer
+
+
+def finer_than(choices, bench) -> tuple:
+    """The densities that may be tried after that of `choices`, those of one step side by side; () for steps that it has taken."""
+    steps = FINER_HATS, CELLS if bench.drive == "current" else FINEST_HATS
+    steps = tuple(tuple(dataclasses.replace(choices, **row) for row in step) for step in steps)
+    if choices.knots is None:
+        return ((),) * len(steps)
+    return tuple(tuple(row for row in step if row.knots is None or row.knots > choices.knots) for step in steps)
 
 
 def _with_parameters(new_problem, z, problem, solution):
@@ -192,7 +212,7 @@ def _with_parameters(new_problem, z, problem, solution):
 
 
 def _resample(problem, solution, spectra, actuator, bench, names, choices):
-    """A problem on finer hats, started from the fitted parameters and the equation error under them."""
+    """A problem with a finer density, started from the fitted parameters and the equation error under them."""
     values = {n: float(problem.layout.value(n, jnp.asarray(solution.z))) for n in names}
     return build_problem(spectra, actuator.replace(values), bench, names, choices)
 

@@ -28,6 +28,13 @@ def folder(tmp_path_factory):
     return path
 
 
+def test_options_that_take_files_may_be_given_again():
+    from magjax.cli.fit import _common
+
+    options = _common("fit", "text", "example").parse_args(["a.csv", "--check", "b.csv", "c.csv", "--check", "d.csv"])
+    assert options.check == ["b.csv", "c.csv", "d.csv"]
+
+
 def test_fit_writes_what_the_interface_promises(folder, capsys, monkeypatch):
     out = folder / "result"
     files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]

@@ -12,7 +12,7 @@ import pytest
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import cell_basis, hat_basis
-from fitting.fit import fit, guessed, loose
+from fitting.fit import finer_than, fit, guessed, loose
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
@@ -20,7 +20,7 @@ from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_no
 from fitting.starts import operator_rows, unfold
 from magjax.bench import load_bench
 from magjax.errors import ConfigurationError, RecordingError
-from magjax.preisach import Preisach
+from magjax.preisach import Preisach, density_masses
 from magjax.recording import Recording
 from tests.studies.joint_fit import NAMES, SINES, TRUTH, one_draw, settled
 
@@ -56,6 +56,28 @@ def test_reaches_the_noise_and_the_constants(result):
         assert abs(estimate.value / true - 1) < 0.01
     assert "noise" in result.message
     assert "coil.R_eddy" in str(result)
+
+
+def test_finer_densities_are_tried_in_steps(bench):
+    hats, cells = finer_than(Choices(), bench)
+    assert [c.knots for c in hats] == [(26, 18)] and [(c.knots, c.level) for c in cells] == [(None, 32), (None, 40)]
+    assert finer_than(hats[0], bench) == ((), cells) and finer_than(cells[0], bench) == ((), ())
+    assert [c.knots for c in finer_than(Choices(), load_bench("rod-eddy"))[1]] == [(36, 24)]
+
+
+@pytest.mark.long
+def test_a_density_of_random_cells_is_fitted_by_masses_of_cells(bench):
+    low, high, rng = -1200.0, 27000.0, np.random.default_rng(1)
+    smooth = concealed_actuator(bench)
+    M_s = float(smooth.magnetostriction.M_s)
+    lognormal = lambda r: np.exp(-0.5 * (np.log(np.maximum(r, 1e-9) / 2500) / 0.6) ** 2) / np.maximum(r, 1.0)
+    even = density_masses(lambda s, r: lognormal(r) * (1 + (s / 9000) ** 2) ** -2, 40, low, high, 0.33 * M_s, refine=4)
+    masses = even * rng.lognormal(0, 0.35, even.shape)
+    truth, rng = dataclasses.replace(smooth, hysteresis=Preisach(masses, low, high, 0.57 * M_s)), np.random.default_rng(3)
+    runs = [record(truth, *d, rng, f"{d[0]}") for d in ((10, 0.8, 0.1), (50, 0.5, -0.2), (120, 0.6, 0.1), (300, 0.7, 0.1))]
+    by_hats, by_cells = (fit(runs, bench, choices=QUICK, refine=refine) for refine in (False, True))
+    assert by_hats.chi2_per_sample > 2 and by_cells.choices.knots is None
+    assert by_cells.chi2_per_sample - 0.95 < 0.3 * (by_hats.chi2_per_sample - 0.95)
 
 
 def test_is_deterministic(recordings, bench, result):
