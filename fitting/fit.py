@@ -22,6 +22,7 @@ CELLS = tuple({"knots": None, "level": level} for level in (32, 40))  # a mass a
 FINEST_HATS = ({"knots": (36, 24), "level": 144},)  # where the field is known loops are steep, and cells too wide
 FINER_FROM = (1.05, 1.5)  # chi2/N from which each is tried,
 FINER_TAKES = (0.7, 0.5)  # and the share of the excess that it may leave
+CELLS_MEET = 1.25  # chi2/N that cells must reach too: they take up physics, but not all of it
 REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
 REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be the density
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
@@ -46,7 +47,7 @@ def fit(
     """Fit an actuator to recordings jointly.
 
     `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
-    of further free parameters; `refine`: let a finer density be chosen where the evidence asks for it, or up to what chi2/N;
+    of further free parameters; `refine`: let a finer density be chosen where the misfit asks for it, or up to what chi2/N;
     Masses that `bench.free` does not name are held at those of `actuator`, with its start memory.
     `progress`: called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early;
     `spectra`: those of the recordings, where another fit of the same has them; `start`: a fit whose density and weights are
@@ -167,6 +168,8 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
             continue
         # a finer density must take its share of the excess, and five standard deviations
         target = min(0.95 * count + takes * max(solution.chi2 - 0.95 * count, 0.0), solution.chi2 - 25)
+        if densities[0].knots is None:
+            target = min(target, CELLS_MEET * count)
 
         def tried(finer, known=problem, before=solution, target=target):
             return lambda say: _on_density(known, before, actuator, bench, names, finer, spectra, target, say)

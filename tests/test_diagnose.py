@@ -124,6 +124,22 @@ def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(mo
     assert reached.tried["backlash"].achieved_chi2_drop == 900.0
 
 
+@pytest.mark.parametrize(("left", "by_cells", "taken"), [
+    (2.0, ((1.6, 32.0), (1.2, 34.0)), 1.2), (2.0, ((1.9, 30.0), (1.5, 45.0)), None), (1.4, (), None),
+])  # fmt: skip
+def test_masses_of_cells_serve_a_final_model_where_they_promise_to_foretell_better(bench, monkeypatch, left, by_cells, taken):
+    """And are not asked for where hats leave little."""
+    now, levels = a_fit(left, 60.0), []
+    now.choices, now.spectra, now.unknowns = Choices(knots=(26, 18), level=104), (), 30.0
+    fits = dict(zip((32, 40), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))
+    for found, (_, unknowns) in zip(fits.values(), by_cells, strict=True):
+        found.unknowns = unknowns
+    monkeypatch.setattr(Task, "fit", lambda task, actuator, choices, **more: levels.append(choices.level) or fits[choices.level])
+    evidence = evidence_of([], now, now, (), {})
+    found = module._by_cells(Task((), bench), evidence)
+    assert sorted(levels) == sorted(fits) and (found and found.excess) == taken
+
+
 def test_what_scores_or_was_fitted_is_not_absorbed():
     candidates = [scored("quartic_magnetostriction", 22.8, 0.003), scored("linear_strain", 3.0, 0.003), scored("mean_field", 2.0)]
     candidates += [scored("accommodation", 4.0, 0.003), scored("creep", 1.0)]
