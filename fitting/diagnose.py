@@ -21,7 +21,7 @@ from .on_lines import hum_score, offset_score
 from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect
 from .search import SECOND_Z, screened, search
 from .setup import Choices, spectra_of, with_held_masses
-from .task import Task
+from .task import Task, freed_beyond
 from .together import together
 from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
 
@@ -123,8 +123,10 @@ def _by_cells(task, evidence) -> Evidence | None:
     ):
         return None
 
+    same = {"extra": freed_beyond(current), "spectra": current.spectra, "refine": False}
+
     def on(choices):
-        return lambda say: task.on(progress=say).fit(current.actuator, choices=choices, spectra=current.spectra, refine=False)
+        return lambda say: task.on(progress=say).fit(current.actuator, choices=choices, **same)
 
     fits = together([on(choices) for choices in finer_than(current.choices, task.bench)[1]], task.progress)
     best = min(fits, key=_cross_validation, default=current)

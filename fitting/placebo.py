@@ -14,7 +14,7 @@ from magjax.scale import Chunk, Job, run_job
 from .scale.bootstrap import model_lines, parametric_noise
 from .scale.refit import lean
 from .search import screened, search
-from .task import Task
+from .task import Task, freed_beyond
 from .verdict import Z_THRESHOLD, too_little
 
 
@@ -58,9 +58,8 @@ def searched(inputs, number, rng) -> dict:
     result, recordings = inputs["result"], inputs["recordings"]
     lines = inputs["lines"] + parametric_noise(result.problem.target, rng)
     spectra = tuple(_reading(s, row) for s, row in zip(result.spectra, lines, strict=True))
-    own = tuple(n for n in result.problem.layout.names if n not in result.bench.free)
     task = Task(recordings, result.bench, result.choices, actuator=result.actuator)
-    base = task.fit_on(result, extra=own, spectra=spectra)
+    base = task.fit_on(result, extra=freed_beyond(result), spectra=spectra)
     candidates = screened(base, result.choices)
     reached = search(task, base, candidates)
     named = [] if too_little(reached, base) else [best.name for best, *_ in reached.steps]

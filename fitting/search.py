@@ -65,9 +65,8 @@ def search(task, base, candidates, check=()) -> Reached:
     `base` was fitted to."""
     state = Reached(base, [], {})
     scored = {c.name: c for c in candidates}
-    asked = task.choices
+    any_rest = task.choices.rest == "auto"
     task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
-    any_rest = asked.rest == "auto"
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
         calm = state.steps and state.current.chi2_per_sample < SILENT_CHI2
@@ -87,11 +86,11 @@ def search(task, base, candidates, check=()) -> Reached:
         further = state.steps and check and not _decides(state.current, best, excess)
         if further and _predicts_worse(state.current, best.result, check, task.bench):
             break
-        left = screened(best.result, asked)
+        left = screened(best.result, task.choices)
         if not state.steps and not _promises(best.result, left):
             best, left = _of_two(task, best, left, good)
         found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(best.result, left))
-        candidates = left if found.result is best.result else screened(found.result, asked)
+        candidates = left if found.result is best.result else screened(found.result, task.choices)
         best = found
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result

@@ -9,6 +9,11 @@ from .fit import fit_or_stop
 from .setup import Choices, effect_parameters
 
 
+def freed_beyond(result) -> tuple[str, ...]:
+    """Names of what a fit frees beyond its bench file: effects' parameters, a sensor's zero."""
+    return tuple(n for n in result.problem.layout.names if n not in result.bench.free)
+
+
 @dataclasses.dataclass(frozen=True)
 class Task:
     """Recordings of a bench to be fitted; `actuator`: what the user gave to start from, or None."""

@@ -131,13 +131,16 @@ def test_masses_of_cells_serve_a_final_model_where_they_promise_to_foretell_bett
     """And are not asked for where hats leave little."""
     now, levels = a_fit(left, 60.0), []
     now.choices, now.spectra, now.unknowns = Choices(knots=(26, 18), level=104), (), 30.0
+    now.bench, now.problem = bench, SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy", "sensor.offset")))
     fits = dict(zip((32, 40), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))
     for found, (_, unknowns) in zip(fits.values(), by_cells, strict=True):
         found.unknowns = unknowns
-    monkeypatch.setattr(Task, "fit", lambda task, actuator, choices, **more: levels.append(choices.level) or fits[choices.level])
+    monkeypatch.setattr(
+        Task, "fit", lambda task, actuator, choices, extra, **more: levels.append((choices.level, extra)) or fits[choices.level]
+    )
     evidence = evidence_of([], now, now, (), {})
     found = module._by_cells(Task((), bench), evidence)
-    assert sorted(levels) == sorted(fits) and (found and found.excess) == taken
+    assert sorted(levels) == [(level, ("sensor.offset",)) for level in sorted(fits)] and (found and found.excess) == taken
 
 
 def test_what_scores_or_was_fitted_is_not_absorbed():

@@ -190,7 +190,8 @@ def _next(found, names):
         return []
     parts = [part(text=sentence(spoken(ask["text"], names)))]
     channels = [c for c in ask.get("channels", []) if c]
-    parts.append(part(text=f"Channels to record: {'; '.join(channels)}.") if channels else None)
+    told = all(c in ask["text"] for c in channels)
+    parts.append(None if told else part(text=f"Channels to record: {'; '.join(channels)}."))
     rows = [[words(a), words(b), plain(p, 2)] for a, b, p in ask.get("separates", [])]
     parts.append(
         part(table=tables.table("What it separates", ["effect", "from", "probability of the right name"], rows)) if rows else None

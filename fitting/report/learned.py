@@ -60,7 +60,7 @@ def _boundaries(unknown):
         "To first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit is with a smooth function there than "
         "without. Visible: the part of it that density and constants cannot make."
     )
-    head = ["block", "function of", "evidence", "share explained", "visible", ""]
+    head = ["block", "function of", "evidence", "share explained", "visible", "choice"]
     return part(table=tables.table("Where a smooth function would serve", head, rows, note))
 
 
