@@ -46,6 +46,7 @@ class Diagnosis:
     floors: dict = dataclasses.field(default_factory=dict)
     where: dict = dataclasses.field(default_factory=dict)
     check: tuple = ()
+    check_left_out: tuple = ()
     next_experiment: dict | None = None
     base: object = None
     repaired: object = None
@@ -53,6 +54,13 @@ class Diagnosis:
 
     def __str__(self):
         return f"{self.verdict}: {self._said()}"
+
+    def without_checks(self, refused) -> "Diagnosis":
+        """The same with a word on check recordings that could not be used; `refused`: a sentence for each."""
+        if not refused:
+            return self
+        noted = " ".join(f"Left out of the checks: {why}." for why in refused)
+        return dataclasses.replace(self, message=f"{self.message} {noted}", check_left_out=tuple(refused))
 
     def _said(self) -> str:
         """The message, and where check recordings ask for more than was fitted."""
@@ -71,7 +79,7 @@ class Diagnosis:
         return {
             "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
             "rivals": self.rivals, "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
-            "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
+            "floors": self.floors, "where": self.where, "check": list(self.check), "check_left_out": list(self.check_left_out), "next_experiment": self.next_experiment,
             "placebo": self.placebo, "message": self._said(), "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
         }  # fmt: skip

@@ -31,6 +31,22 @@ def load_recordings(paths, bench) -> list[Recording]:
     return recordings
 
 
+def load_checks(paths, bench) -> tuple[list[Recording], tuple[str, ...]]:
+    """Recordings to check against, and a sentence for each that cannot be used: no fit needs them, so they end none.
+
+    Raises `RecordingError` where a file does not exist.
+    """
+    recordings, refused = [], []
+    for path in map(Path, paths):
+        try:
+            recordings += load_recordings([path], bench)
+        except RecordingError as error:
+            if not path.exists():
+                raise
+            refused.append(str(error))
+    return recordings, tuple(refused)
+
+
 def load_calibrations(paths, bench) -> list[Recording]:
     """Calibrations of the sensor: time, `reference` (the known displacement, m, by a reference sensor) and the reading.
 

@@ -7,10 +7,12 @@ import jax
 import numpy as np
 import pytest
 
+import fitting.diagnose
 import fitting.fit
 import fitting.paper
 from fitting.demo import concealed_actuator, record
 from fitting.fit import fit
+from fitting.verdict import Diagnosis
 from magjax.bench import load_bench
 from magjax.cli import COMMANDS, main
 from magjax.model_file import load_model
@@ -172,6 +174,22 @@ def test_bad_recordings_say_the_mend_in_one_line(tmp_path, capsys, kind, words):
     error = capsys.readouterr().err.strip()
     assert words in error and "bad.csv" in error and "\n" not in error
     assert not (out / "fit.json").exists()
+
+
+def test_a_check_recording_that_cannot_be_used_ends_nothing(tmp_path, capsys, monkeypatch):
+    """It takes part in no fit: it is left out and told. One that is not there is a slip of the pen."""
+    held = []
+    monkeypatch.setattr(
+        fitting.diagnose, "diagnose", lambda *a, check, **k: held.append(len(check)) or Diagnosis("nothing_missing", "All is well.")
+    )
+    good, bad = write(tmp_path / "good.csv", good_rows()), write(tmp_path / "bad.csv", *spoil("clipped"))
+    command = ["diagnose", good, "--bench", "aa-050h", "--quiet", "--check"]
+    assert main([*command, good, bad, "--out", str(tmp_path / "out")]) == 0
+    said, kept = capsys.readouterr().out, json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert held == [1] and "bad.csv" in said and "clipped" in said and "Left out of the checks" in said
+    assert kept["verdict"] == "nothing_missing" and "bad.csv" in kept["check_left_out"][0] and kept["message"] in said
+    assert main([*command, str(tmp_path / "none.csv")]) == 3
+    assert "no such file" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

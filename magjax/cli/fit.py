@@ -59,7 +59,7 @@ def run_fit(arguments) -> int:
     options = p.parse_args(arguments)
     check_intervals(options)
     prepare_jax()
-    from magjax.recording import load_recordings
+    from magjax.readers import load_checks, load_recordings
 
     folder = output_folder(options.out)
     from fitting.check import check_errors
@@ -76,7 +76,7 @@ def run_fit(arguments) -> int:
         return run_fleet(options, choices, folder, Progress(options.quiet))
     bench, actuator = _bench_and_start(options)
     recordings = load_recordings(options.recordings, bench)
-    checks = load_recordings(options.check, bench) if options.check else []
+    checks, refused = load_checks(options.check, bench)
     with Progress(options.quiet) as progress:
         result = fit(recordings, bench, actuator=actuator, extra=effect_parameters(actuator), choices=choices, progress=progress)
         (more, text), stopped = ({}, ""), None
@@ -86,6 +86,7 @@ def run_fit(arguments) -> int:
             stopped = error
         content = result.as_dict() | more
         content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
+        content["check_left_out"] = list(refused)
         table = None
         if options.recipe:
             from fitting.recipe import recipe_beside
@@ -109,6 +110,8 @@ def run_fit(arguments) -> int:
             print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g})")
         if note := beyond_text(content["check"]):
             print(f"  {note}")
+        for why in refused:
+            print(f"  left out of the checks: {why}")
         if folder:
             print(f"\nresults in {folder} (report.html, fit.json, model.json)")
     if stopped is not None:
@@ -134,8 +137,7 @@ def run_diagnose(arguments) -> int:
     check_placebo(options)
     prepare_jax()
     from magjax.errors import RecordingError
-    from magjax.readers import load_calibrations
-    from magjax.recording import load_recordings
+    from magjax.readers import load_calibrations, load_checks, load_recordings
 
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
@@ -149,10 +151,10 @@ def run_diagnose(arguments) -> int:
     recordings, checks, stopped = [], [], None
     try:
         recordings = load_recordings(options.recordings, bench)
-        checks = load_recordings(options.check, bench) if options.check else []
+        checks, refused = load_checks(options.check, bench)
         with Progress(options.quiet) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
-                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress)  # fmt: skip
+                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress).without_checks(refused)  # fmt: skip
             if options.placebo and found.verdict != "data_problem":
                 try:
                     found = with_placebo(found, recordings, options, progress)

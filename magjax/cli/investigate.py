@@ -55,15 +55,15 @@ def analysis(bench, folder, options, live):
         from fitting.diagnose import Diagnosis, diagnose
         from fitting.report import write_diagnosis
         from magjax.errors import RecordingError
-        from magjax.recording import load_recordings
+        from magjax.readers import load_checks, load_recordings
 
         from .runtime import output_folder
 
         recordings, held = [], []
         try:
             recordings = load_recordings(files, bench)
-            held = load_recordings(checks, bench) if checks else []
-            found = diagnose(recordings, bench, check=held, progress=progress)
+            held, refused = load_checks(checks, bench)
+            found = diagnose(recordings, bench, check=held, progress=progress).without_checks(refused)
         except RecordingError as error:
             found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
         content = found.as_dict()

@@ -53,7 +53,7 @@ def specimens() -> dict:
     )  # fmt: skip
     found = specimen(Diagnosis, candidates=(specimen(Candidate, name="creep"),), base=fitted, repaired=fitted)
     return {
-        "fit": {**fitted.as_dict(), "check": [], "recipe": None, "bootstrap": None, "profile": None}, "diagnosis": {**found.as_dict(), "base": None, "repaired": None},
+        "fit": {**fitted.as_dict(), "check": [], "check_left_out": [], "recipe": None, "bootstrap": None, "profile": None}, "diagnosis": {**found.as_dict(), "base": None, "repaired": None},
         "model": model_as_dict(actuator, bench), "check": Card("", {"samples": ""}, ()).as_dict(),
     }  # fmt: skip
 
