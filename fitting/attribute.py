@@ -61,6 +61,7 @@ def excess_of(result, at_noise: float = AT_NOISE) -> float:
 
 # known rivals to first order whose score says little once the base has bent to the other: tried wherever that one is
 COMPANIONS = {"second_eddy_path": "amplifier_lag", "transport_delay": "sensor_lag"}
+FEEDBACKS = ("stress_feedback",)  # its column says little where the base has bent far: tried where all leaders leave a misfit
 STRUCTURES = ("eddy_currents",)  # their column at null says little: at their real size they change which relays switch
 
 
@@ -106,7 +107,11 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
     effect = effect_class(**candidate.shapes).with_amplitude(
         amplitude if abs(amplitude) > 1e-12 * info.scale else 1e-3 * info.scale
     )
-    result = task.fit_on(base, base.actuator.with_effect(effect), target=target)
+    actuator = base.actuator.with_effect(effect)
+    if candidate.name in FEEDBACKS:  # the base's density has bent to do what it does: not from there
+        result = task.fit(actuator, choices=base.choices, spectra=base.spectra, refine=False, target=target)
+    else:
+        result = task.fit_on(base, actuator, target=target)
     return credited(candidate, result, base, effect, excess)
 
 
@@ -154,6 +159,11 @@ def rivals_of(best: Trial, trials) -> list[Trial]:
         if behind < max(TIE, weak, MISFIT_TIE * rest) or (behind < 2 * TIE and _same(t, best)):
             tied.append(t)
     return sorted(tied, key=lambda t: t.bic_change)
+
+
+def of_one_family(a: Trial, b: Trial) -> bool:
+    """Whether two effects look alike to first order."""
+    return _alike(a.candidate, b.candidate) > FAMILY
 
 
 def _same(a: Trial, b: Trial) -> bool:

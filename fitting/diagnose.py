@@ -62,10 +62,15 @@ def diagnose(
     if alternation := alternating(recordings, spectra, bench.output):
         asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress}
         return alternation.told(diagnose(alternation.cleaned, bench, **asked))
-    if problem := data_problem(recordings, spectra, bench.output):
-        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=task.fit(refine=False))
+    problem = data_problem(recordings, spectra, bench.output)
     adopted, cleaned = _record_level(recordings, spectra, bench, choices)
-    return _examined(task.on(recordings=tuple(cleaned)), task, adopted, check)
+    if problem and (not adopted or data_problem(cleaned, spectra_of(cleaned, bench, choices.harmonics), bench.output)):
+        return Diagnosis("data_problem", problem + ".", data_problem=problem, base=task.fit(refine=False))
+    found = _examined(task.on(recordings=tuple(cleaned)), task, adopted, check)
+    if not problem:
+        return found
+    names = " and ".join(effect.name for effect, _ in adopted)
+    return dataclasses.replace(found, message=f"{found.message} As recorded, before {names} was taken out: {problem}.")
 
 
 def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:

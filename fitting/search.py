@@ -12,6 +12,7 @@ from magjax.effects import SensorLag
 from .attribute import (
     BIC_DROP,
     CLOSE,
+    FEEDBACKS,
     MIN_DROP,
     MISFIT,
     SETTLED_CHI2,
@@ -24,6 +25,7 @@ from .attribute import (
     excess_of,
     family,
     leaders,
+    of_one_family,
     rivals_of,
     settled,
     try_effect,
@@ -40,8 +42,10 @@ HOPELESS = 2.0  # times what a repair may leave, after two effects
 NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within which rivals are tried beside later ones; how many
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
-LEADS_WITHIN, RIVALS_OF_TWO, ALIKE = 5.0, 2, 0.05  # of the best's chi2, how many, and how far apart in theirs
-IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two
+LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
+IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise
+FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
+NEAR_SHARE = 0.25  # of an early effect's fall, within which too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
@@ -83,13 +87,15 @@ def search(task, base, candidates, check=()) -> Reached:
         best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
         if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
             break
+        if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)):
+            break
         further = state.steps and check and not _decides(state.current, best, excess)
         if further and _predicts_worse(state.current, best.result, check, task.bench):
             break
         left = screened(best.result, task.choices)
-        if not state.steps and not _promises(best.result, left):
+        if not state.steps and not _promises(base, best.result, left):
             best, left = _of_two(task, best, left, good)
-        found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(best.result, left))
+        found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(base, best.result, left))
         candidates = left if found.result is best.result else screened(found.result, task.choices)
         best = found
         state.steps.append((best, rivals_of(best, good), good, state.current))
@@ -130,6 +136,9 @@ def _trials(task, current, top, candidates, excess) -> list[Trial]:
         top = [c for c in top[SIDE_BY_SIDE:] if not _needless(c, trials)]
     best = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
     like = family(best.candidate, candidates, {t.name for t in trials}) if best else []
+    if best and best.result.chi2_per_sample > MISFIT:
+        known = {t.name for t in trials} | {c.name for c in like}
+        like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]
     for k in range(0, len(like), SIDE_BY_SIDE):
         attempt(like[k : k + SIDE_BY_SIDE])
     return trials
@@ -183,7 +192,8 @@ def _exchange(task, state):
     """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
     that was not theirs."""
     for index, (best, _, good, previous) in enumerate(state.steps[:-1]):
-        near = [t for t in good if t is not best and t.bic_change < best.bic_change + NEAR_RIVAL * chi2_of(best.result)]
+        behind = max(NEAR_RIVAL * chi2_of(best.result), NEAR_SHARE * best.drop)
+        near = [t for t in good if t is not best and t.bic_change < best.bic_change + behind]
         if not near or best.name not in {e.name for e in state.current.actuator.effects}:
             continue
         rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
@@ -243,33 +253,38 @@ def _commuted(task, state, candidate) -> bool:
     return found is swapped
 
 
-def _promises(result, candidates) -> bool:
-    """Whether a further effect promises more than half of a misfit: then the density waits, for a finer one would take it up."""
-    return bool(candidates) and result.chi2_per_sample > FAR_BESIDE and candidates[0].z ** 2 > HALF * excess_of(result)
+def _promises(base, result, candidates) -> bool:
+    """Whether a further effect promises more than half of a misfit, and more than the form of those found leaves: then the
+    density waits, for a finer one would take it up."""
+    least = max(HALF * excess_of(result), FORM_ERROR * (chi2_of(base) - chi2_of(result)))
+    return bool(candidates) and result.chi2_per_sample > FAR_BESIDE and candidates[0].z ** 2 > least
 
 
 def _of_two(task, best, left, good):
     """The best and the scores beside it; or a rival's, with which a further effect explains what the best leaves.
 
-    One effect with shapes of its own imitates two others better than either of them alone.
+    One effect with shapes of its own imitates two others better than either of them alone; and where none takes most, the
+    first to be found is seldom one of the two. Rivals of other directions are looked ahead from by their scores.
     """
-    if best.result.chi2_per_sample < MISFIT or best.explained_share < IMITATES:
+    if best.result.chi2_per_sample < MISFIT:
         return best, left
-    tried = [best]
+    tried, ahead = [best], []
+    near = MISFIT if best.explained_share > IMITATES else FAR_FROM_NOISE
     for rival in sorted((t for t in good if t is not best), key=lambda t: chi2_of(t.result)):
-        far = chi2_of(rival.result) > LEADS_WITHIN * chi2_of(best.result)
-        if far or len(tried) > RIVALS_OF_TWO:
+        if chi2_of(rival.result) > LEADS_WITHIN * chi2_of(best.result) or len(tried) > RIVALS_OF_TWO:
             break
-        if any(abs(chi2_of(t.result) / chi2_of(rival.result) - 1) < ALIKE for t in tried):  # of one family
+        if any(abs(chi2_of(t.result) / chi2_of(rival.result) - 1) < SAME or of_one_family(t, rival) for t in tried):
             continue
         tried.append(rival)
         scores = screened(rival.result, task.choices)
         first, excess = scores[0], excess_of(rival.result)
-        if first.z**2 < HALF * excess or chi2_of(rival.result) - first.z**2 > chi2_of(best.result) - MIN_DROP:
-            continue
-        pair = _to_the_end(task, rival.result, first, excess)
+        promised = chi2_of(rival.result) - first.z**2
+        if first.z**2 > HALF * excess and promised < chi2_of(best.result) - MIN_DROP:
+            ahead.append((promised, rival, scores))
+    for _, rival, scores in sorted(ahead, key=lambda row: row[0]):
+        pair = _to_the_end(task, rival.result, scores[0], excess_of(rival.result))
         cost = (rival.parameters + pair.parameters - best.parameters) * np.log(pair.result.data_count)
-        met = pair.physical and pair.result.chi2_per_sample < MISFIT
+        met = pair.physical and pair.result.chi2_per_sample < near
         if met and chi2_of(pair.result) + cost < chi2_of(best.result) - max(BIC_DROP, HALF * excess_of(best.result)):
             return rival, scores
     return best, left

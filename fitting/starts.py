@@ -12,6 +12,9 @@ from magjax.preisach.operator import unreached_share
 
 from .spectra import evaluate_lines
 
+NEAR_ZERO = 0.3  # of the largest |M|, below which it may change sign
+SIGNS = 50  # instants of a period at which the sign of M is sought
+
 
 def everett_rows(basis, alpha, beta) -> np.ndarray:
     """T(alpha, beta) of every basis function at total mass 1, (points, unknowns)."""
@@ -114,22 +117,36 @@ def _reversible(actuator, voltage):
 
 
 def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
-    """The signed M behind |M| over a period: where |M| nearly touches zero it may have changed sign.
+    """The signed M behind |M|, `root`, over a period of equidistant samples: where |M| nearly touches zero it may change sign.
 
-    Of the two readings, one sign throughout and a change at every such touch, the one whose M follows the drive's
-    direction is taken; M is positive where the drive is largest.
+    Of all signs the ones whose M bends least (a change of sign makes a corner of |M| a straight line), found by dynamic
+    programming over `SIGNS` instants, which average the noise; M is positive where the drive is largest.
     """
-    turns = (root <= np.roll(root, 1)) & (root < np.roll(root, -1)) & (root < 0.2 * root.max())
-    if not 2 <= turns.sum() <= 8:
+    n, top = len(root), int(np.argmax(drive))
+    count = min(SIGNS, n)
+    edges = np.arange(count + 1) * n // count
+    size = np.sqrt(np.add.reduceat(np.roll(root, -top) ** 2, edges[:-1]) / np.diff(edges))
+    may = np.append(size, size[:2]) < NEAR_ZERO * size.max()
+    if not may.any():
         return root
-    sign = np.where(np.cumsum(turns) % 2 == 0, 1.0, -1.0)
-    changed = root * sign * sign[np.argmax(drive)]
-    direction = np.sign(np.roll(drive, -1) - drive)
-
-    def against(M):
-        return -np.minimum((np.roll(M, -1) - M) * direction, 0.0).sum()
-
-    return changed if turns.sum() % 2 == 0 and against(changed) < against(root) else root
+    closed = np.append(size, size[:2])
+    signs = np.array([1.0, -1.0])
+    cost = np.array([[0.0, np.inf], [np.inf, np.inf]])  # [sign before, sign now]; the first two are positive
+    came = []
+    for k in range(2, count + 2):
+        before, now = closed[k - 2] * signs, closed[k - 1] * signs
+        bend = (before[:, None, None] - 2 * now[:, None] + closed[k] * signs) ** 2  # [two before, before, now]
+        turned = np.where((signs[:, None] == signs) | may[k] | may[k - 1], 0.0, np.inf)
+        total = cost[:, :, None] + bend + turned
+        came.append(np.argmin(total, axis=0))
+        cost = total.min(axis=0)
+    path = [0, 0]  # backwards from where it ends, as it began
+    for back in came[::-1]:
+        path.append(int(back[path[-1], path[-2]]))
+    signed = size * signs[path[::-1][:count]]
+    middles = 0.5 * (edges[:-1] + edges[1:] - 1)
+    found = np.interp(np.arange(n), middles, signed, period=n)
+    return root * np.roll(np.where(found < 0, -1.0, 1.0), top)
 
 
 def equation_error_start(basis, spectra, deviations, actuator, solve, max_frequency=None, rest=None):

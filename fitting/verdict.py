@@ -79,10 +79,10 @@ class Diagnosis:
         return {
             "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
             "rivals": self.rivals, "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
-            "floors": self.floors, "where": self.where, "check": list(self.check), "check_left_out": list(self.check_left_out), "next_experiment": self.next_experiment,
+            "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
             "placebo": self.placebo, "message": self._said(), "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
-        }  # fmt: skip
+        } | ({"check_left_out": list(self.check_left_out)} if self.check_left_out else {})  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import fitting.search
 from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of
 from fitting.screen import Candidate
 from fitting.search import Reached
@@ -192,3 +193,40 @@ def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, 
         reached, (), plain, plain, (), (), SimpleNamespace(drive="current"), (["check"], ["check"]), {}, where, ()
     )
     assert module.verdict(evidence).verdict == word
+
+
+def searched(monkeypatch, ends, follows):
+    """`search._of_two` with trials that end at chi2/N `ends`; `follows`: after each the best score, and where a fit of it ends."""
+    trials = [trial(n, x, base=110.0, direction=d) for n, x, d in ends]
+    scores = {id(t.result): [candidate(follows[t.name][0], follows[t.name][1])] for t in trials}
+    monkeypatch.setattr(fitting.search, "screened", lambda result, choices: scores[id(result)])
+    monkeypatch.setattr(
+        fitting.search, "_to_the_end",
+        lambda task, result, c, excess: next(trial(c.name, follows[t.name][2], 2) for t in trials if t.result is result),
+    )  # fmt: skip
+    best = trials[0]
+    return fitting.search._of_two(Task((), None), best, scores[id(best.result)], trials)[0].name
+
+
+def test_where_no_effect_takes_most_it_is_looked_ahead_from_each(monkeypatch):
+    """Two effects at once: the one that takes most by itself is neither of them."""
+    ends = [("second_eddy_path", 62.0, (1, 0, 0)), ("strain_hysteresis", 69.5, (0, 1, 0)), ("field_diffusion", 70.3, (0, 0, 1))]
+    follows = {"second_eddy_path": ("second_mode", 100.0, 36.0), "strain_hysteresis": ("creep", 60.0, 50.0)}
+    assert searched(monkeypatch, ends, follows | {"field_diffusion": ("delta_e", 219.0, 1.7)}) == "field_diffusion"
+    # it must keep its promise
+    assert searched(monkeypatch, ends, follows | {"field_diffusion": ("delta_e", 219.0, 36.0)}) == "second_eddy_path"
+
+
+def test_where_one_effect_takes_most_two_must_meet_the_noise(monkeypatch):
+    ends = [("second_eddy_path", 5.0, (1, 0, 0)), ("transport_delay", 9.0, (0, 1, 0))]
+    follows = {"second_eddy_path": ("creep", 10.0, 4.8)}
+    assert searched(monkeypatch, ends, follows | {"transport_delay": ("duffing_stiffness", 74.0, 1.1)}) == "transport_delay"
+    assert searched(monkeypatch, ends, follows | {"transport_delay": ("duffing_stiffness", 74.0, 1.7)}) == "second_eddy_path"
+
+
+def test_what_the_form_of_a_law_leaves_promises_nothing():
+    """A hundredth of a per cent of what was found is left by the law's form, however it scores."""
+    base, after = (trial("excess_loss", x).result for x in (150.0, 2.1))
+    assert not fitting.search._promises(base, after, [candidate("rate_dependent_switching", 20.0)])
+    assert fitting.search._promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 26.0)])
+    assert not fitting.search._promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 15.0)])

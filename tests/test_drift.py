@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+import fitting.diagnose
 from fitting.floors import data_problem
 from fitting.record_level import record_effects, remove_from_checks, remove_record_effect
 from fitting.setup import spectra_of
+from fitting.verdict import Diagnosis
 from magjax.bench import load_bench
 from magjax.recording import Recording
 
@@ -72,6 +74,25 @@ def test_a_strong_drift_of_a_short_record_is_no_data_problem():
         runs = records(beside)
         found = data_problem(runs, spectra_of(runs, BENCH), "displacement")
         assert (found is not None) is wrong
+
+
+@pytest.mark.parametrize("drifting", [(0, 1, 2, 3), (1,)], ids=["all", "one"])
+def test_a_large_drift_of_every_record_is_named_and_that_of_one_spoils_it(monkeypatch, drifting):
+    """Four microns of forty: what every record shows is taken out, named and told; one that drifts alone is to be recorded again."""
+    plain, moved = records(), records(lambda t: 4e-6 * t / t[-1])
+    runs = [moved[k] if k in drifting else plain[k] for k in range(4)]
+    monkeypatch.setattr(fitting.diagnose.Task, "fit", lambda self, *a, **k: None)
+
+    def examined(task, measured, adopted, check):
+        left = [np.ptp(r.channels["displacement"][::500]) for r in task.recordings]  # one sample a period
+        assert max(left) < 1e-6
+        return Diagnosis("attributed", f"{adopted[0][0].name} was left out.")
+
+    monkeypatch.setattr(fitting.diagnose, "_examined", examined)
+    found = fitting.diagnose.diagnose(runs, BENCH)
+    assert "the reading drifts by 3e-06" in found.message and "let it warm up" in found.message
+    assert found.verdict == ("data_problem" if len(drifting) == 1 else "attributed")
+    assert found.message.startswith("zero_drift was left out. As recorded") == (len(drifting) == 4)
 
 
 def test_check_recordings_lose_what_was_adopted_and_no_more():

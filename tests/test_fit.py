@@ -1,6 +1,8 @@
 """The joint fit on an invented bench: the noise reached, the constants within their errors, determinism, outcomes."""
 
 import dataclasses
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -9,6 +11,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
+import magjax.bench
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import cell_basis, hat_basis
@@ -261,6 +264,40 @@ def test_unfold_finds_the_sign_of_M():
     # the one sample beside the crossing may fall on either side
     assert unfold(np.abs(M), drive) == pytest.approx(M, abs=0.035)
     assert unfold(np.abs(drive + 3), drive) == pytest.approx(drive + 3)
+
+
+@pytest.mark.parametrize("offset", [2.0, 1.1, 1.0, 0.9, 0.5, 0.2, 0.0])
+def test_unfold_sees_through_noise(offset):
+    """Magnetizations that stay positive, just touch zero and cross it, behind a reading with noise: the sign of every loop."""
+    rng, phase = np.random.default_rng(4), 2 * np.pi * np.arange(200) / 200
+    for lag, bend in rng.uniform((0.0, -0.3), (0.8, 0.3), (10, 2)):
+        M = np.sin(phase - lag) + offset + bend * np.cos(2 * phase)
+        drive = np.sin(phase)
+        reading = M**2 + 1e-3 * rng.standard_normal(200)
+        found = unfold(np.sqrt(np.maximum(reading, 0.0)), drive)
+        assert np.sqrt(np.mean((found - M * np.sign(M[np.argmax(drive)])) ** 2)) < 0.1
+
+
+@pytest.mark.parametrize("bias", [4000.0, 0.0])
+def test_loops_of_an_actuator_with_little_bias_are_met(tmp_path, bias):
+    """The magnetization passes zero and the displacement folds there: butterflies, which hide the sign of M."""
+    text = Path(magjax.bench.__file__).with_name("benches").joinpath("aa-050h.toml").read_text()
+    (tmp_path / "bench.toml").write_text(re.sub(r"H_bias *= *[0-9.e+]+", f"H_bias = {bias}", text))
+    bench = load_bench(tmp_path / "bench.toml")
+
+    def density(s, r):
+        return np.exp(-0.5 * (np.log(np.maximum(r, 1e-9) / 1500) / 0.6) ** 2) / np.maximum(r, 1.0) * (1 + (s / 9000) ** 2) ** -2
+
+    truth = bench.actuator().replace(TRUE)
+    masses = density_masses(density, 80, -22e3, 22e3, 0.9 * float(truth.magnetostriction.M_s), refine=4)
+    truth = dataclasses.replace(truth, hysteresis=Preisach(masses, -22e3, 22e3))
+    rng = np.random.default_rng(3)
+    drives = ((10, 0.8, 0.1), (40, 0.5, -0.1), (80, 0.8, 0.1), (200, 0.5, 0.2))
+    runs = [record(truth, *drive, rng, str(drive)) for drive in drives]
+    assert runs[0].channels["displacement"].min() < 1e-7  # it does touch
+    got = fit(runs, bench, choices=QUICK, refine=False)
+    assert got.chi2_per_sample < 1.2
+    assert all(abs(got.estimate(n).value - true) < 4 * got.estimate(n).stderr for n, true in TRUE.items())
 
 
 def test_what_an_independent_bench_does_elsewhere_is_foretold(bench):

@@ -73,7 +73,7 @@ DIAGNOSIS = {
     "floors": "what limits the residual, in the unit of the channel",
     "where": "where the misfit of the base sits",
     "check": "one entry a check recording and channel",
-    "check_left_out": "a sentence for each check recording that could not be used",
+    "check_left_out": "only where a check recording could not be used: a sentence for each",
     "next_experiment": "null, or the recording that best tells the rivals apart",
     "placebo": "null, or how often the same search cries wolf on simulations of the final model (--placebo)",
     "base": "the content of fit.json for the model without the effects",
