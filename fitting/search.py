@@ -310,11 +310,19 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
         found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra).choices
     if found == chosen:
         return best, good, task
-    task = task.on(choices=found)
+    before, task = task, task.on(choices=found)
     near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
 
     def anew(t):
-        return lambda say: _to_the_end(task.on(progress=say), current, t.candidate, excess)
+        def one(say):
+            told = task.on(progress=say)
+            result = told.fit_on(t.result, t.result.actuator)  # from the plain fit's density, of another memory, it may end far off
+            return settled(told, current, credited(t.candidate, result, current, result.actuator.effect(t.name), excess), excess)
 
-    again = [t for t in together([anew(t) for t in near], task.progress) if t.physical] or [best]
-    return min(again, key=lambda t: t.bic_change), again, task
+        return one
+
+    again = [t for t in together([anew(t) for t in near], task.progress) if t.physical]
+    ended = min(again, key=lambda t: t.bic_change, default=best)
+    if not again or chi2_of(ended.result) > chi2_of(best.result) + MIN_DROP:
+        return best, good, before
+    return ended, again, task

@@ -24,6 +24,7 @@ NULL_CHI2 = 0.95
 ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
 CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: right effects on smooth densities leave less
+WELL_FORETOLD = (10.0, 0.05)  # misfit of a check recording from which, and the share of it up to which, FULL_SHARE is enough
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
@@ -165,10 +166,11 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
         "candidates": _achieved(evidence), "repaired": current if steps or evidence.adopted else None,
     }  # fmt: skip
-    full = FULL_SHARE if evidence.excess < CLEAN_CHI2 else FULLER_SHARE
+    before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
+    foretold = before > WELL_FORETOLD[0] * len(rows) and after < WELL_FORETOLD[1] * before
+    full = FULL_SHARE if evidence.excess < CLEAN_CHI2 or foretold else FULLER_SHARE
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         return _unknown(evidence, common)
-    before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
     if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
     effects, groups, sizes, rivals = _found(evidence)

@@ -106,16 +106,27 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     best = trial("second_mode", 1.0)
     best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
-    fit = lambda *a, choices, **k: other if choices.rest == "auto" else pytest.fail("not asked")
+    again, spoiled = [], []
+
+    def fit(*a, choices, start, **k):
+        if choices.rest == "auto":
+            return other
+        assert start is best.result  # not the plain fit, whose density belongs to another memory
+        again.append(choices.rest)
+        return best.result if not spoiled else SimpleNamespace(**vars(best.result) | {"chi2_per_sample": 90.0})
+
     monkeypatch.setattr("fitting.task.fit_or_stop", fit)
-    again = []
-    monkeypatch.setattr(module, "try_effect", lambda task, *a: again.append(task.choices.rest) or best)
+    monkeypatch.setattr(module, "credited", lambda c, result, *a: dataclasses.replace(best, result=result))
+    best.result.actuator = SimpleNamespace(effect=lambda name: None, effects=())
     task = Task((), load_bench("aa-050h"), Choices(rest=held))
     assert task.bench.start == "auto"
     *_, asked = module._finer(task, None, best, [best], 1.0)
     assert asked.choices.rest == (found if taken else held) and again == ([found] if taken else [])
     *_, fixed = module._finer(task, None, best, [best], 1.0, any_rest=False)
     assert fixed.choices.rest == held
+    spoiled.append(True)  # what ends far off from there is not taken
+    kept, _, back = module._finer(task, None, best, [best], 1.0)
+    assert kept is best and back.choices.rest == held
 
 
 @pytest.mark.parametrize(
@@ -165,22 +176,25 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
 
 
 @pytest.mark.parametrize(
-    ("chi2n", "after", "word"),
+    ("chi2n", "before", "after", "word"),
     [
-        (1.0, (1.05, 1.1), "attributed"),
-        (1.0, (1.3, 4.0), "unknown_at"),
-        (1.4, (1.05, 1.1), "attributed"),
-        (2.0, (1.05, 1.1), "unknown_at"),
+        (1.0, (1.4, 2.0), (1.05, 1.1), "attributed"),
+        (1.0, (1.4, 2.0), (1.3, 4.0), "unknown_at"),
+        (1.4, (1.4, 2.0), (1.05, 1.1), "attributed"),
+        (2.0, (1.4, 2.0), (1.05, 1.1), "unknown_at"),
+        (2.0, (7.0, 8.0), (1.05, 1.3), "attributed"),
+        (2.0, (7.0, 8.0), (1.05, 3.0), "unknown_at"),
+        (10.5, (7.0, 8.0), (1.05, 1.3), "unknown_at"),
     ],
-    ids=["foretells", "foretells worse", "a little left", "much left"],
+    ids=["foretells", "foretells worse", "a little left", "much left", "much left and all foretold", "not all", "far too much"],
 )
-def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, chi2n, after, word):
+def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, chi2n, before, after, word):
     """One of two check recordings may get better and the other far worse: together they are worse."""
     import fitting.verdict as module
 
     rows = [
         {"file": "c", "unit": "m", "rms_before": b * 4e-8, "rms_after": a * 4e-8, "noise_rms": 4e-8}
-        for b, a in zip((1.4, 2.0), after, strict=True)
+        for b, a in zip(before, after, strict=True)
     ]
     monkeypatch.setattr(module, "check_errors", lambda *a: rows)
     monkeypatch.setattr(module, "exchange", lambda *a: None)
