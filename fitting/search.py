@@ -57,11 +57,15 @@ def screened(result, choices) -> list:
 
 @dataclasses.dataclass
 class Reached:
-    """The current fit, adopted trials with their rivals, all trials of the last round."""
+    """The current fit, adopted trials with their rivals, all trials of the last round.
+
+    `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were.
+    """
 
     current: object
     steps: list
     tried: dict
+    form: str | None = None
 
 
 def search(task, base, candidates, check=()) -> Reached:
@@ -88,6 +92,8 @@ def search(task, base, candidates, check=()) -> Reached:
         if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
             break
         if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)):
+            if check and not _predicts_worse(state.current, best.result, check, task.bench):
+                state.current, state.form = best.result, best.name
             break
         further = state.steps and check and not _decides(state.current, best, excess)
         if further and _predicts_worse(state.current, best.result, check, task.bench):
@@ -325,4 +331,5 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
     ended = min(again, key=lambda t: t.bic_change, default=best)
     if not again or chi2_of(ended.result) > chi2_of(best.result) + MIN_DROP:
         return best, good, before
-    return ended, again, task
+    far = [t for t in good if t.name not in {a.name for a in again}]  # no rivals alone, but they may be beside a later effect
+    return ended, [*again, *far], task

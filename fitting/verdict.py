@@ -26,6 +26,7 @@ FULL_SHARE = 0.96
 CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: right effects on smooth densities leave less
 WELL_FORETOLD = (10.0, 0.05)  # misfit of a check recording from which, and the share of it up to which, FULL_SHARE is enough
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
+FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
@@ -185,7 +186,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         found = _grouped(evidence, common | {"rivals": sizes}, effects, groups, rivals, swap, asked)
     else:
         found = _attributed(evidence, common, effects, swap, asked)
-    return dataclasses.replace(found, message=found.message + ROUGH_TEXT) if rough else found
+    form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
+    return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
 
 
 def _achieved(evidence) -> tuple:

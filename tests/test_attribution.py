@@ -120,8 +120,10 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     best.result.actuator = SimpleNamespace(effect=lambda name: None, effects=())
     task = Task((), load_bench("aa-050h"), Choices(rest=held))
     assert task.bench.start == "auto"
-    *_, asked = module._finer(task, None, best, [best], 1.0)
+    far = trial("creep", 2.0)
+    _, kept, asked = module._finer(task, None, best, [best, far], 1.0)
     assert asked.choices.rest == (found if taken else held) and again == ([found] if taken else [])
+    assert names(kept) == ["second_mode", "creep"]  # it may serve beside a later effect
     *_, fixed = module._finer(task, None, best, [best], 1.0, any_rest=False)
     assert fixed.choices.rest == held
     spoiled.append(True)  # what ends far off from there is not taken
@@ -244,3 +246,29 @@ def test_what_the_form_of_a_law_leaves_promises_nothing():
     assert not fitting.search._promises(base, after, [candidate("rate_dependent_switching", 20.0)])
     assert fitting.search._promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 26.0)])
     assert not fitting.search._promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 15.0)])
+
+
+@pytest.mark.parametrize(
+    ("check", "worse"), [((), False), (("check",), False), (("check",), True)], ids=["none", "better", "worse"]
+)
+def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypatch, check, worse):
+    """A second effect that takes half a per cent of what the first took: in the model where it foretells, not in the verdict."""
+    base = trial("excess_loss", 150.0).result
+    ends = {"excess_loss": 2.0, "rate_dependent_switching": 1.4}  # beside it
+
+    def fitted(task, current, top, candidates, excess):
+        name = "excess_loss" if current is base else "rate_dependent_switching"
+        return [trial(name, ends[name], base=current.chi2_per_sample)]
+
+    monkeypatch.setattr(fitting.search, "_trials", fitted)
+    monkeypatch.setattr(fitting.search, "screened", lambda result, choices: [candidate("rate_dependent_switching", 20.0)])
+    monkeypatch.setattr(fitting.search, "_finer", lambda task, now, best, good, *a: (best, good, task))
+    monkeypatch.setattr(fitting.search, "_predicts_worse", lambda *a: worse)
+    base.choices, base.actuator = Choices(), SimpleNamespace(effects=())
+    for part in ("_backward", "_exchange", "_commuted"):
+        monkeypatch.setattr(fitting.search, part, lambda *a: None)
+    found = fitting.search.search(Task((), None), base, [candidate("excess_loss", 250.0)], check)
+    taken = bool(check) and not worse
+    assert [step[0].name for step in found.steps] == ["excess_loss"]
+    assert found.form == ("rate_dependent_switching" if taken else None)
+    assert found.current.chi2_per_sample == (1.4 if taken else 2.0)
