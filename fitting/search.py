@@ -196,34 +196,34 @@ def _backward(task, state):
 
 def _exchange(task, state):
     """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
-    that was not theirs."""
-    for index, (best, _, good, previous) in enumerate(state.steps[:-1]):
-        behind = max(NEAR_RIVAL * chi2_of(best.result), NEAR_SHARE * best.drop)
-        near = [t for t in good if t is not best and t.bic_change < best.bic_change + behind]
-        if not near or best.name not in {e.name for e in state.current.actuator.effects}:
-            continue
-        rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
-        own = Trial(
-            best.candidate,
-            state.current,
-            0.0,
-            best.parameters * np.log(rest.data_count),
-            True,
-            best.explained_share,
-            best.parameters,
-        )
-        trials = [own]
-        near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
+    that was not theirs. Where that changes one, the same goes for the last."""
+    changed = [_exchanged(task, state, index) for index in range(len(state.steps) - 1)]
+    if any(changed):
+        _exchanged(task, state, len(state.steps) - 1)
 
-        def beside(t, rest=rest):
-            return lambda say: _to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP)
 
-        for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
-            trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
-        trials = [t for t in trials if t.physical]
-        found = min(trials, key=lambda t: t.bic_change)
-        state.steps[index] = (found, rivals_of(found, trials), trials, previous)
-        state.current = found.result
+def _exchanged(task, state, index) -> bool:
+    """The best of an effect adopted and its near rivals, beside all others; whether it is another."""
+    best, _, good, previous = state.steps[index]
+    behind = max(NEAR_RIVAL * chi2_of(best.result), NEAR_SHARE * best.drop)
+    near = [t for t in good if t is not best and t.bic_change < best.bic_change + behind]
+    if not near or best.name not in {e.name for e in state.current.actuator.effects}:
+        return False
+    rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
+    cost = best.parameters * np.log(rest.data_count)
+    trials = [Trial(best.candidate, state.current, 0.0, cost, True, best.explained_share, best.parameters)]
+    near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
+
+    def beside(t):
+        return lambda say: _to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP)
+
+    for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
+        trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
+    trials = [t for t in trials if t.physical]
+    found = min(trials, key=lambda t: t.bic_change)
+    state.steps[index] = (found, rivals_of(found, trials), trials, previous)
+    state.current = found.result
+    return found.name != best.name
 
 
 def _commuted(task, state, candidate) -> bool:

@@ -272,3 +272,40 @@ def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypat
     assert [step[0].name for step in found.steps] == ["excess_loss"]
     assert found.form == ("rate_dependent_switching" if taken else None)
     assert found.current.chi2_per_sample == (1.4 if taken else 2.0)
+
+
+@pytest.mark.parametrize(("changed", "asked"), [(False, [0, 1]), (True, [0, 1, 2])])
+def test_where_an_early_effect_is_exchanged_so_may_the_last_be(monkeypatch, changed, asked):
+    found = []
+    monkeypatch.setattr(fitting.search, "_exchanged", lambda task, state, index: found.append(index) or (changed and index == 0))
+    fitting.search._exchange(None, Reached(None, [None] * 3, {}))
+    assert found == asked
+
+
+@pytest.mark.parametrize(("ends", "name"), [(1.2, "excess_loss"), (1.9, "rate_dependent_switching")], ids=["better", "worse"])
+def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, ends, name):
+    best, rival, far = (
+        trial(n, x, base=150.0) for n, x in (("rate_dependent_switching", 20.0), ("excess_loss", 45.0), ("creep", 99.0))
+    )
+    held = SimpleNamespace(effects=(SimpleNamespace(name="rate_dependent_switching"),), without_effect=lambda name: held)
+
+    @dataclasses.dataclass
+    class Result:
+        chi2_per_sample: float
+        data_count: int = COUNT
+        actuator: object = dataclasses.field(default_factory=lambda: held)
+
+    current = Result(1.6)
+    steps = [(best, [best], [best, rival, far], None), (trial("sensor_lag", 1.6, base=20.0), [], [], None)]
+    tried = []
+
+    def fitted(task, rest, c, excess):
+        tried.append(c.name)
+        assert rest.chi2_per_sample == 1.6
+        return dataclasses.replace(trial(c.name, ends, base=1.6), result=Result(ends))
+
+    monkeypatch.setattr(fitting.search, "_to_the_end", fitted)
+    state = Reached(current, steps, {})
+    assert fitting.search._exchanged(Task((), None), state, 0) is (name == "excess_loss")
+    assert tried == ["excess_loss"] and state.steps[0][0].name == name  # what takes far less is not tried
+    assert state.current.chi2_per_sample == min(ends, 1.6)
