@@ -1,5 +1,7 @@
 """One table over the whole catalogue: identity at null, gradients, batching, declared facts."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 
 import magjax.effects as effects
 from magjax.chain import BLOCKS, Timeline
+from magjax.chain.mechanics import Mechanics
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.simulate import run_chain, simulate
 from tests.test_simulate import actuator, sine
@@ -87,12 +90,16 @@ def test_a_limited_voltage_bounds_the_current():
     assert 0.1 < free.mean() < 0.9 and np.array_equal(current[free], command[free])
 
 
-@pytest.mark.parametrize("presliding", [3e-7, 2e-6])
-def test_friction_with_presliding_against_its_equation_in_time(presliding):
+@pytest.mark.parametrize(
+    "f,v_s,presliding,tolerance",
+    [(4e-7, 1e-7, 3e-7, 0.02), (4e-7, 1e-7, 2e-6, 0.02), (4e-7, 1e-3, 1e-8, 0.03), (2e-6, 1e-5, 1e-7, 0.02)],
+    ids=["Dahl", "Dahl wide", "viscous", "sticks"],
+)
+def test_friction_against_its_equation_in_time(f, v_s, presliding, tolerance):
     from scipy.integrate import solve_ivp
 
     act = actuator(20)
-    effect = effects.CoulombFriction(f=4e-7, v_s=1e-7, presliding=presliding)
+    effect = effects.CoulombFriction(f=f, v_s=v_s, presliding=presliding)
     signals = simulate(act.with_effect(effect), CURRENT, DT, periodic=True)
     free = np.asarray(signals.free_displacement)
     w, xi = 2 * np.pi * float(act.mechanics.f0), float(act.mechanics.xi)
@@ -101,12 +108,29 @@ def test_friction_with_presliding_against_its_equation_in_time(presliding):
 
     def rate(t, state):
         y, v, p = state
-        return [v, w * w * (pull(t) - y - 4e-7 * p) - 2 * xi * w * v, (v - abs(v) * p) / presliding]
+        return [v, w * w * (pull(t) - y - f * p) - 2 * xi * w * v, (abs(v) + v_s) * (np.tanh(v / v_s) - p) / presliding]
 
     exact = solve_ivp(rate, (0, times[-1]), [free[0], 0, 0], "LSODA", times, rtol=1e-7, atol=1e-12, max_step=DT).y[0, 3 * N : 4 * N]
     without = np.asarray(simulate(act, CURRENT, DT, periodic=True).displacement)
-    error = np.asarray(signals.displacement) - exact
-    assert np.sqrt(np.mean(error**2)) < 0.03 * np.sqrt(np.mean((without - exact) ** 2))
+    rms = lambda a: np.sqrt(np.mean(a**2))
+    assert rms(np.asarray(signals.displacement) - exact) < tolerance * rms(without - exact)
+    record = simulate(act.with_effect(effect), jnp.tile(CURRENT, 3), DT, periodic=False)  # from rest, as a whole record
+    assert rms(np.asarray(record.displacement)[2 * N :] - np.asarray(signals.displacement)) < 2 * tolerance * rms(without - exact)
+
+
+def test_a_rod_that_sticks_stays_calm_on_a_coarse_grid():
+    act = dataclasses.replace(actuator(20), mechanics=Mechanics(jnp.asarray(400.0), jnp.asarray(0.1)))
+    effect = effects.CoulombFriction(f=1.2e-6, v_s=1e-6, presliding=1.5e-7)
+
+    def lost(count):  # 10 Hz; at 125 samples hardly three a swing of the rod
+        line = Timeline(jnp.asarray(0.1 / count), count, True)
+        turn = 2 * jnp.pi * jnp.arange(count) / count
+        pull = 2e-5 * jnp.sin(turn) + 6e-6 * jnp.sin(2 * turn + 1)
+        linear = line.filter(pull, act.mechanics.response)
+        return np.asarray(effect.displacement(linear, pull, None, line, act) - linear)[:: count // 125]
+
+    coarse, fine = lost(125), lost(2000)
+    assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.04 * np.sqrt(np.mean(fine**2))
 
 
 def test_smooth_friction_approaches_coulomb():

@@ -30,18 +30,25 @@ class Mechanics(eqx.Module):
             return line.filter(free_displacement, self.response)
         return self._march(free_displacement, line.dt)
 
-    def _march(self, u, dt):
+    def held(self, dt):
+        """Exact step of the state (y, y'/w0) for a forcing linear in between: A (2, 2), gains of its start and of its rise, (2,).
+
+        state <- A @ state + gain * forcing + rise * (next forcing - forcing).
+        """
         w0 = 2 * jnp.pi * self.f0
         zero, one = jnp.zeros_like(w0), jnp.ones_like(w0)
         # states y, y'/w0 with the forcing's present value and its slope a step appended: one matrix exponential is exact;
         # y' itself would make entries of w0^2, too large for it where a step holds many periods of a stiff stack
         rows = [[zero, w0, zero, zero], [-w0, -2 * self.xi * w0, w0, zero], [zero, zero, zero, one / dt], [zero] * 4]
         full = jax.scipy.linalg.expm(dt * jnp.stack([jnp.stack(r) for r in rows]))
-        A, b_now, b_slope = full[:2, :2], full[:2, 2], full[:2, 3]
+        return full[:2, :2], full[:2, 2], full[:2, 3]
+
+    def _march(self, u, dt):
+        A, gain, rise = self.held(dt)
 
         def advance(state, pair):
             now, following = pair
-            state = A @ state + b_now * now + b_slope * (following - now)
+            state = A @ state + gain * now + rise * (following - now)
             return state, state[0]
 
         start = jnp.stack([u[0], jnp.zeros_like(u[0])])

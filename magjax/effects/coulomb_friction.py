@@ -6,15 +6,17 @@ from jaxtyping import Array, Float
 
 from ..param import param
 from .base import AbstractEffect
-from .forces import with_force
 
-STEEPEST = 2.0  # f over presliding, both m: a rod springs back by 2 f at a turn, so that a shorter way hardly shows
+STEEPEST = 50.0  # f over presliding, both m: a rod springs back by 2 f at a turn, so that a shorter way hardly shows
+NEWTON = 8  # steps to the displacement that a sample's friction allows; from the side where they only approach
+PASSES = 3  # over a period; each begins with the steady response to the friction of the one before
 
 
 class CoulombFriction(AbstractEffect):
-    """Friction as an equivalent displacement F/k by Dahl's law in its exact step, smooth below a velocity scale.
+    """Friction as an equivalent displacement F/k: Dahl's law, viscous below a velocity, solved sample by sample.
 
-    The way of presliding is taken as f/2 at least.
+    It may exceed what the rod's stiffness moves within the presliding, so that the rod sticks at its turns. The way of
+    presliding is taken as f/50 at least.
     """
 
     f: Float[Array, ""] = param(0.0, "m", "friction force over stiffness", low=0.0, scale=1e-7, null=0.0, typical=(1e-8, 5e-6))
@@ -27,7 +29,9 @@ class CoulombFriction(AbstractEffect):
 
     name = "coulomb_friction"
     block = "mechanics"
-    law = "force -k f p, dp/dy = (tanh(y'/v_s) - sign(y') p)/presliding; Coulomb's law as v_s, presliding -> 0"
+    law = (
+        "force -k f p, dp/dt = (|y'| + v_s)(tanh(y'/v_s) - p)/presliding; Dahl's law as v_s -> 0, Coulomb's as presliding -> 0 too"
+    )
     source = "P. R. Dahl (1968); C. Canudas de Wit et al., IEEE Trans. Autom. Control 40 (1995) 419, and references there"
     signature = "a step at each turning point, of the same size at every amplitude and frequency"
     amplitude = "f"
@@ -35,18 +39,55 @@ class CoulombFriction(AbstractEffect):
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with friction, m."""
         way = jnp.maximum(jnp.maximum(self.presliding, self.f / STEEPEST), 1e-10)
+        slow = jnp.maximum(self.v_s, 1e-9) * line.dt  # m a sample
+        mechanics = actuator.mechanics
+        A, gain, rise = mechanics.held(line.dt)
+        # steps too coarse for the resonance hold the friction of their end: linear in between, a rod that sticks would swing up
+        coarse = (jnp.pi * mechanics.f0 * line.dt) ** 2
+        rise = rise + coarse / (1 + coarse) * (gain - rise)
+        reach = self.f * rise[0]  # what full friction takes back within the sample
 
-        def force(y):
-            aim = jnp.tanh(line.derivative(y) / jnp.maximum(self.v_s, 1e-9))
-            keep = jnp.exp(-jnp.abs(y - jnp.roll(y, 1)) / way)
-            if not line.periodic:
-                keep = keep.at[0].set(1.0)  # unstrained at the start
+        def turned(moved, p):
+            keep = jnp.exp(-(jnp.abs(moved) + slow) / way)
+            aim = jnp.tanh(moved / slow)
+            slope = (1 - aim**2) / slow * (1 - keep) + (aim - p) * keep * jnp.sign(moved) / way
+            return aim + (p - aim) * keep, slope
 
-            def join(a, b):  # p -> keep p + gain, one after the other
-                return a[0] * b[0], a[1] * b[0] + b[1]
+        def allowed(free, p):
+            """`moved` with moved + reach turned(moved, p) = free: the left side rises, and from the near end Newton only approaches."""
+            at_rest = reach * p * jnp.exp(-slow / way)
+            ahead = free > at_rest
+            low = jnp.where(ahead, jnp.maximum(free - reach, 0.0), free - at_rest)
+            high = jnp.where(ahead, free - at_rest, jnp.minimum(free + reach, 0.0))
+            near = jnp.where(ahead, low, high)
+            moved = jnp.where(near == 0, jnp.where(ahead, 1.0, -1.0) * 1e-300, near)
+            for _ in range(NEWTON):
+                p_there, slope = turned(moved, p)
+                left = moved + reach * p_there - free
+                low, high = jnp.where(left < 0, moved, low), jnp.where(left < 0, high, moved)
+                step = moved - left / (1 + reach * slope)
+                moved = jnp.where((step >= low) & (step <= high), step, 0.5 * (low + high))
+            return moved
 
-            kept, gained = jax.lax.associative_scan(join, (keep, (1 - keep) * aim.at[0].set(jnp.where(line.periodic, aim[0], 0.0))))
-            start = gained[-1] / jnp.maximum(1 - kept[-1], 1e-12) if line.periodic else 0.0
-            return -self.f * (kept * start + gained)
+        def advance(carry, linear):
+            state, p, before = carry  # of the friction's own motion; turned share; displacement with friction
+            rest = A @ state - (gain - rise) * self.f * p
+            free = linear + rest[0] - before
+            moved = jax.lax.stop_gradient(allowed(*jax.lax.stop_gradient((free, p))))
+            p_there, slope = turned(moved, p)  # one differentiable step more
+            moved = moved - (moved + reach * p_there - free) / jax.lax.stop_gradient(1 + reach * slope)
+            p = turned(moved, p)[0]
+            state = rest - rise * self.f * p
+            return (state, p, linear + state[0]), (p, state[0])
 
-        return with_force(displacement, force, line, actuator, rounds=10, stiffness=jnp.minimum(0.5 * self.f / way, 0.8))
+        state, p = jnp.zeros(2, displacement.dtype), jnp.zeros_like(displacement[0])
+        if not line.periodic:
+            _, (_, own) = jax.lax.scan(advance, (state, p, displacement[0]), displacement)
+            return displacement + own
+        for _ in range(PASSES):
+            (_, p, _), (late, _) = jax.lax.scan(advance, (state, p, displacement[-1] + state[0]), displacement)
+            force = -self.f * late
+            own = line.filter(force, mechanics.response)
+            velocity = line.filter(force, lambda s: mechanics.response(s) * s / (2 * jnp.pi * mechanics.f0))
+            state = jnp.stack([own[-1], velocity[-1]])
+        return displacement + own
