@@ -4,6 +4,9 @@ At an honest crest the signal is round: what rests within a tolerance of the ext
 either side, hides an arch of height L s1 s2 / (2 (s1 + s2)) by these slopes, which is that tolerance again, whatever the
 curvature. At a clipped crest the arch is far higher, and the slopes begin at once, at a corner; where a reading saturates they
 begin slowly. A level that is held on purpose has a corner, too, but straight or sudden flanks, or holds at other levels.
+
+In noise coarser than a converter's counts no value comes back often: a limit that does, or a stretch of equal samples, was not
+measured.
 """
 
 import numpy as np
@@ -15,6 +18,9 @@ MOST_JUDGED = 16  # crests, evenly over the record
 ARCH = 4.0  # hidden height in tolerances; one where the crest is a parabola, two for t^4
 LARGEST = 0.021  # tolerance in spans: above it noise hides what a crest is like
 CORNER = 0.5  # slope beside the plateau over that farther off; 0.75 where a sine is cut, 0.4 for t^4, less where it saturates
+NOISY = 1.5  # counts of noise, rms: from here on values seldom come back
+TIED, TIED_MORE = 8, 4.0  # samples that equal the extreme, and how many times as often as a level near it
+STUCK = 10  # equal samples in a row
 CORNER_IN_NOISE = 0.65  # a plateau of many tolerances' depth has lost the slow part of a round approach
 
 
@@ -27,6 +33,11 @@ def quantum(values: np.ndarray) -> float:
         return float(steps.min()) if len(steps) else 0.0
     step = float(np.quantile(steps, 0.1, method="lower"))
     for _ in range(6):  # as Euclid does, but for strays: levels seldom visited leave gaps of several steps
+        for most in (4, 20):  # a step read from rounded figures, by more of its multiples
+            times = np.round(steps / step)
+            alike = (times > 0) & (times <= most) & (np.abs(steps - times * step) < 0.02 * step)
+            if alike.any():
+                step = float(steps[alike] @ times[alike] / (times[alike] @ times[alike]))
         beside = np.abs(steps - step * np.round(steps / step))
         if np.mean(beside < 0.05 * step) > 0.9:
             return step
@@ -44,10 +55,25 @@ def fast_noise(values: np.ndarray) -> float:
     return float(np.quantile(moving, 0.25) / (0.3186 * np.sqrt(70))) if len(moving) else 0.0
 
 
+def _in_noise(values: np.ndarray) -> float:
+    """The fast noise of a channel, (time,), most of which moves by more than `NOISY` counts of it; 0 of others."""
+    if len(values) < 4 * FEWEST:
+        return 0.0
+    noise = float(np.quantile(np.abs(np.diff(values, 4)), 0.25) / (0.3186 * np.sqrt(70)))
+    return noise if noise > max(NOISY * quantum(values), 1e-7 * np.ptp(values)) else 0.0
+
+
 def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarray | None = None):
-    """Raise `RecordingError` where a channel, (time,), is clipped; `drive`, (time,): what may hold still meanwhile."""
+    """Raise `RecordingError` where a channel, (time,), is clipped or stuck; `drive`, (time,): what may hold still meanwhile."""
+    values = np.asarray(values, float)
+    stuck = stuck_stretch(values)
+    if stuck is not None:
+        raise RecordingError(
+            f"{name}: {channel} stands still at {values[stuck[0]]:.6g} for {stuck[1]} samples from sample {stuck[0]}, in which its "
+            "noise is gone: samples were lost or the converter hung; record again or cut there"
+        )
     for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
-        found = clipped_crest(sign * np.asarray(values, float), drive)
+        found = clipped_crest(sign * values, drive) or cut_in_noise(sign * values)
         if found is not None:
             first, length = found
             level = float(np.median(values[first : first + length]))
@@ -86,6 +112,28 @@ def clipped_crest(x: np.ndarray, drive: np.ndarray | None = None) -> tuple[int, 
             if not _holds_elsewhere(x, best[1], tolerance, span) and not _rests(drive, *best):
                 return best
     return None
+
+
+def stuck_stretch(x: np.ndarray) -> tuple[int, int] | None:
+    """(first sample, samples) of the longest stretch of equal samples, (time,), that noise would not leave; None without one."""
+    runs = [run for run in _runs(np.diff(x) == 0) if run[1] >= STUCK - 1]
+    if not runs or not _in_noise(x):
+        return None
+    # at a limit a signal may rest: that is clipping
+    inside = [(a, n + 1) for a, n in runs if x.min() < x[a] < x.max()]
+    return max(inside, key=lambda run: run[1]) if inside else None
+
+
+def cut_in_noise(x: np.ndarray) -> tuple[int, int] | None:
+    """(first sample, samples) of the tops of a signal, (time,), cut with their noise: its highest value comes far too often."""
+    noise = _in_noise(x)
+    if not noise:
+        return None
+    at_top = np.flatnonzero(x == x.max())
+    near = np.unique(x[(x < x.max()) & (x > x.max() - 4 * noise)], return_counts=True)[1]
+    if len(at_top) < max(TIED, TIED_MORE * near.max(initial=1)):
+        return None
+    return max(_runs(x == x.max()), key=lambda run: run[1])
 
 
 def _runs(where) -> list[tuple[int, int]]:

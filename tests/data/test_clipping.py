@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magjax.bench import load_bench
-from magjax.clipping import clipped_crest, quantum
+from magjax.clipping import clipped_crest, cut_in_noise, quantum, refuse_clipping, stuck_stretch
 from magjax.errors import RecordingError
 from magjax.readers import _read_csv, load_recordings
 from magjax.recording import Recording
@@ -24,7 +24,7 @@ def phases(samples, periods=3.37):
 
 
 def is_clipped(x):
-    return clipped_crest(x) is not None or clipped_crest(-x) is not None
+    return any(f(side) is not None for f in (clipped_crest, cut_in_noise) for side in (x, -x))
 
 
 @pytest.mark.parametrize("bits", BITS)
@@ -92,6 +92,32 @@ def test_noise_after_the_cut_does_not_hide_it():
     y = np.minimum(1e-5 * np.sin(2 * np.pi * t), 8e-6) + 1e-9 * np.random.default_rng(0).standard_normal(len(t))
     with pytest.raises(RecordingError, match="clipped at its highest value"):
         Recording(t, {"current": np.sin(2 * np.pi * t), "displacement": y})
+
+
+@pytest.mark.parametrize("bits", [16, None])
+def test_crests_cut_with_their_noise_by_little_are_clipped(bits):
+    noise = 1e-3 * np.random.default_rng(4).standard_normal(4000)
+    x = np.sin(2 * np.pi * phases(1000, 4)) + noise
+    level = np.quantile(x, 0.93)  # noise of a third of what is cut off: no plateau is whole
+    assert is_clipped(counted(np.minimum(x, level), bits)) and not is_clipped(counted(x, bits))
+
+
+def test_few_counts_on_a_small_sine_are_no_plateau():
+    step = 2.0 / 2**15
+    x = -0.3 + 0.274 * np.sin(2 * np.pi * (phases(1000, 4)))  # seven samples on one count at its lowest
+    x = np.round(np.round(x / step) * step, 7)
+    assert quantum(x) == pytest.approx(step, rel=1e-3) and not is_clipped(x)
+
+
+@pytest.mark.parametrize("bits", [12, 16, None])
+def test_a_converter_that_hangs_is_told(bits):
+    noise = 1e-3 * np.random.default_rng(5).standard_normal(2000)
+    x = counted(0.8 * np.sin(2 * np.pi * phases(500, 4)) + noise, bits)
+    assert stuck_stretch(x) is None
+    x[1100:1140] = x[1100]
+    assert stuck_stretch(x) == (1100, 40)
+    with pytest.raises(RecordingError, match="stands still at .* for 40 samples from sample 1100"):
+        refuse_clipping("run.csv", "displacement", x)
 
 
 @pytest.mark.parametrize("step, levels", [(15, [0, 15, 29, 44, 58, 73]), (3, [0, 9, 12, 21, 30]), (1, range(200))])
