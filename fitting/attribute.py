@@ -26,6 +26,7 @@ TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
 WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
 SAME_DIRECTION = 0.97
 OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law imitates another
+DETAIL_SHARE = 0.3  # of the misfit that an effect takes where the details of its law are tried
 AT_NOISE = 0.92  # chi2/N at which a fit with nothing missing ends
 MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
 MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart
@@ -116,12 +117,25 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
 
 
 def settled(task, base, trial, excess, target: float = np.inf) -> Trial:
-    """The trial, gone on with where it ended far from its start, unsettled, and came near the `target`."""
+    """The trial, gone on with where it ended far from its start, unsettled, and came near the `target`; then in detail."""
     result = trial.result
-    if result.converged or not chi2_of(result) < target:
+    if not result.converged and chi2_of(result) < target:
+        result = task.fit_on(result, result.actuator, choices=result.choices, spectra=base.spectra, target=target)
+        trial = credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
+    return _in_detail(task, base, trial, excess)
+
+
+def _in_detail(task, base, trial, excess) -> Trial:
+    """The trial with the details of its effect's law where it takes a part of the misfit and leaves some, and they take more."""
+    result = trial.result
+    if not (trial.explained_share > DETAIL_SHARE and result.chi2_per_sample > MISFIT):
         return trial
-    result = task.fit_on(result, result.actuator, choices=result.choices, spectra=base.spectra, target=target)
-    return credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
+    effect = result.actuator.effect(trial.name).in_detail()
+    if effect is None:
+        return trial
+    finer = task.fit_on(result, result.actuator.with_effect(effect), choices=result.choices, spectra=base.spectra)
+    finer = credited(trial.candidate, finer, base, effect, excess)
+    return finer if finer.bic_change < trial.bic_change - BIC_DROP else trial
 
 
 def credited(candidate, result, base, effect, excess) -> Trial:
@@ -130,7 +144,7 @@ def credited(candidate, result, base, effect, excess) -> Trial:
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
     drop = chi2_of(base) - chi2_of(result)
     physical = all(_physical(e, result) for e in result.actuator.effects)
-    number = len(effect.parameters())
+    number = len(effect.free_parameters())
     extra = number * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
     return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), number)

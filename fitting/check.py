@@ -15,16 +15,20 @@ def prediction(actuator, recording, bench):
     measured = np.asarray(recording.channels[bench.output], float)
     if recording.frequency() is None:
         signals = simulate(actuator, recording.channels[bench.drive], recording.dt, outside="saturate")  # told by `beyond_plane`
-        return np.asarray(signals.reading), measured, None
+        predicted = np.asarray(signals.reading)
+        return predicted, _levelled(measured, predicted, recording, bench), None
     s = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
     corners = int(4 * np.ceil(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) / 4))
     lines = np.asarray(predicted_lines(Predictor.build([s], 500, 40, 4, corners), actuator))[0]
     phases = np.arange(s.samples) * s.dt * s.frequency
     predicted = evaluate_lines(lines, phases)
-    measured = measured[: s.samples]
-    if bench.output == "flux_density":
-        measured = measured - measured.mean() + predicted.mean()
-    return predicted, measured, s.noise_rms
+    return predicted, _levelled(measured[: s.samples], predicted, recording, bench), s.noise_rms
+
+
+def _levelled(measured, predicted, recording, bench):
+    """The reading, at the prediction's mean where its own says nothing: an integrated emf, a zero of this recording's own."""
+    free = bench.output == "flux_density" and recording.frequency() is not None
+    return measured - measured.mean() + predicted.mean() if free or recording.origin.get("zero") else measured
 
 
 def beyond_plane(actuator, recording, bench) -> float:

@@ -11,27 +11,40 @@ import numpy as np
 from magjax.bench import load_bench
 
 from .alternation import alternating
-from .attribute import MIN_DROP, TIE, WEAK_TIE, chi2_of, excess_of
+from .attribute import MIN_DROP, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
 from .fit import FINER_FROM, REFINE_BELOW, finer_than
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term
 from .locate import where
-from .on_lines import hum_score, offset_score
-from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect
+from .on_lines import hum_score, offset_score, zeros_score
+from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect, zeros_of
 from .search import SECOND_Z, screened, search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task, freed_beyond
 from .together import together
-from .verdict import FULL_SHARE, ROUGH_CHI2, SILENT_CHI2, Z_THRESHOLD, Diagnosis, Evidence, misfit, too_little, verdict
+from .verdict import (
+    FULL_SHARE,
+    ROUGH_CHI2,
+    SILENT_CHI2,
+    Z_THRESHOLD,
+    Diagnosis,
+    Evidence,
+    least_excess,
+    misfit,
+    too_little,
+    verdict,
+)
 
 RECORD_Z = 8.0
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
+MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
 ABSORBED_VISIBILITY = 0.004
 LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
+COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -84,6 +97,9 @@ def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
         cleaned, hum, freed = found
         return _examined(cleaned, measured, [*adopted, hum], check, freed)
     plain, candidates, zero, rival = _sensor_zero(task, plain, candidates)
+    if zero is None and (found := _own_zeros(task, adopted, plain, candidates)):
+        cleaned, zeros, freed = found
+        return _examined(cleaned, measured, [*adopted, zeros], check, freed)
     free = task.held if zero is None else (*task.held, "sensor.offset")
     raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
     checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
@@ -182,6 +198,31 @@ def _hum_on_harmonics(task, adopted, base, candidates=()):
     return cleaned, (effect, []), freed
 
 
+def _own_zeros(task, adopted, base, candidates):
+    """A zero that changes from recording to recording: adopted if it promises about as much as any effect, alone meets the
+    noise, and the effects that promise as much do not serve as well. Returns the task with free means, the effect with its
+    rivals, and its fit; None elsewhere.
+    """
+    held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
+    if held or bench.output != "displacement" or _quasistatic(bench) or not base.chi2_per_sample > least_excess(base):
+        return None
+    excess = excess_of(base)
+    z, zeros, errors = zeros_score(base.problem, base.refined)
+    likely = [c for c in candidates if c.z**2 > z**2 - max(TIE, WEAK_TIE[0] * z**2)]
+    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 * (1 - WEAK_TIE[0]) - TIE for c in candidates)]):
+        return None
+    effect, *rivals = zeros_of(base.spectra, z, zeros, errors, [e.name for e, _ in adopted])
+    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
+    freed = cleaned.fit(base.actuator)
+    if freed.chi2_per_sample > least_excess(freed) or chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
+        return None
+    cost = chi2_of(freed) + len(zeros) * np.log(freed.data_count)
+    trials = (settled(task, base, try_effect(task, base, c, excess), excess) for c in likely[:MOST_LIKELY])
+    if any(t.physical and chi2_of(t.result) + t.parameters * np.log(freed.data_count) < cost for t in trials):
+        return None
+    return cleaned, (effect, rivals), freed
+
+
 def _sensor_zero(task, base, candidates):
     """A sensor whose zero is not the rod's rest: part of the base, if it scores above any effect and alone meets the noise.
 
@@ -212,11 +253,17 @@ def _sensor_zero(task, base, candidates):
 
 def _screened_finer(task, base, candidates, free):
     """The base and its candidates; where none would take half of what is left, a finer density is given a chance first."""
-    best = max((c.z**2 for c in candidates), default=0.0)
-    meant = REFINE_BELOW <= base.chi2_per_sample < UNEXPLAINED and base.choices.knots is not None
-    if not meant or best > 0.5 * (chi2_of(base) - base.data_count):
+    above = chi2_of(base) - base.data_count
+    best = max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)
+    if base.chi2_per_sample < REFINE_BELOW or base.choices.knots is None or best > 0.5 * above:
         return base, candidates
-    finer = task.fit_on(base, base.actuator, extra=free, choices=base.choices, refine=UNEXPLAINED)
+    finer = base
+    if base.chi2_per_sample > UNEXPLAINED:  # physics, most likely: unless the next density takes nearly all of it
+        for choices in finer_than(base.choices, task.bench)[0]:
+            finer = task.fit_on(base, base.actuator, extra=free, choices=choices)
+        if chi2_of(finer) - finer.data_count > COARSE * above:
+            return base, candidates
+    finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=UNEXPLAINED)
     return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, task.choices))
 
 

@@ -21,6 +21,17 @@ def offset_score(problem, solution) -> float:
     return float(-(part @ projector.residual) / max(np.linalg.norm(part), 1e-300))
 
 
+def zeros_score(problem, solution):
+    """A zero of its own in every reading, beside everything the base can do: (z of the scale of one column's, zeros, their
+    standard errors; unit of the reading)."""
+    projector = Projector(problem, solution)
+    columns = _projected(problem, projector, [(n, 0, 1.0) for n in range(len(problem.spectra))])
+    zeros, *_ = np.linalg.lstsq(columns, -projector.residual, rcond=1e-6)
+    fall = float(projector.residual @ projector.residual - np.sum((projector.residual + columns @ zeros) ** 2))
+    errors = np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns, rcond=1e-12)))
+    return float(np.sqrt(max(fall - len(zeros), 0.0))), zeros, errors
+
+
 def hum_score(problem, solution):
     """Hum where it falls on harmonics of the drive, beside everything the base can do: each tone has one amplitude, and a
     phase of its own in each recording. What a rough density leaves there, or a single recording, has no size in common.

@@ -67,6 +67,15 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
     return sorted(found.values(), key=lambda e: -abs(e.z))
 
 
+def zeros_of(spectra, z: float, zeros, errors, adopted=()) -> list[RecordEffect]:
+    """A zero of its own in every recording: of the sensor or, as likely from these alone, of a rod that warms and cools
+    between them; or of that which drifts within them, among the names `adopted`."""
+    shapes = {"zeros": float(max(s.peak_to_peak for s in spectra))}
+    size, error = float(np.sqrt(np.mean(np.square(zeros)))), float(np.sqrt(np.mean(np.square(errors))))
+    both = ("zero_drift", "thermal_drift")
+    return [RecordEffect(name, z, size, error, shapes) for name in [n for n in both if n in adopted][:1] or both]
+
+
 def hum_of(spectra, z: float, tones) -> RecordEffect:
     """Hum known from harmonics that it falls on (`on_lines.hum_score`), joined to what shows of it between the others."""
     between, shown, fits = _hum(spectra, tones[0][0], [a for _, a in tones])
@@ -174,7 +183,9 @@ def _between(s, column):
 
 
 def remove_record_effect(recordings, effect, output):
-    """The recordings with a record-level signal taken out of the reading."""
+    """The recordings with a record-level signal taken out of the reading; with zeros of their own, their means are set free."""
+    if size := effect.shapes.get("zeros"):
+        return [dataclasses.replace(r, origin={**r.origin, "zero": size}) for r in recordings]
     cleaned = []
     for recording, column in zip(recordings, effect.columns, strict=True):
         signal = np.zeros(len(recording.time))
@@ -197,7 +208,10 @@ def remove_from_checks(recordings, adopted, bench):
     hum are found between its own harmonics. Recordings that do not repeat come back as they are."""
     cleaned = []
     for recording in recordings:
-        for effect in adopted if recording.frequency() is not None else ():
+        if zeros := next((e for e in adopted if e.shapes.get("zeros")), None):
+            recording = remove_record_effect([recording], zeros, bench.output)[0]
+        between = [e for e in adopted if not e.shapes.get("zeros")]
+        for effect in between if recording.frequency() is not None else ():
             spectra = with_noise([reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)])
             if effect.name == "mains_hum":
                 columns = tuple(_hum(spectra, effect.shapes["f"], [a for _, a in effect.shapes["tones"]])[2])

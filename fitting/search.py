@@ -19,6 +19,7 @@ from .attribute import (
     STRUCTURES,
     TIE,
     WEAK_TIE,
+    WORTH,
     Trial,
     chi2_of,
     credited,
@@ -137,11 +138,16 @@ def _trials(task, current, top, candidates, excess) -> list[Trial]:
         trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], task.progress))
         let_go()
 
+    least = WORTH * abs(top[0].z)
     while top:
         attempt(top[:SIDE_BY_SIDE])
         top = [c for c in top[SIDE_BY_SIDE:] if not _needless(c, trials)]
     best = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
     like = family(best.candidate, candidates, {t.name for t in trials}) if best else []
+    if best and best.explained_share < IMITATES and best.result.chi2_per_sample > FAR_FROM_NOISE:
+        # none takes most: a strong effect may act unlike its derivative at null
+        known = {t.name for t in trials} | {c.name for c in like}
+        like += [c for c in candidates if c.name not in known and abs(c.z) > least and c.visibility > 1e-3]
     if best and best.result.chi2_per_sample > MISFIT:
         known = {t.name for t in trials} | {c.name for c in like}
         like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]

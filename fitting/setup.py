@@ -75,8 +75,8 @@ def applied_range(spectra, actuator):
 
 
 def effect_parameters(actuator) -> tuple[str, ...]:
-    """Names of the parameters of an actuator's effects, none for None: what `fit` frees with `extra`."""
-    return tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.parameters())
+    """Names of the free parameters of an actuator's effects, none for None: what `fit` frees with `extra`."""
+    return tuple(f"effects.{e.name}.{p}" for e in (actuator.effects if actuator is not None else ()) for p in e.free_parameters())
 
 
 def free_parameters(bench, actuator, extra=()):

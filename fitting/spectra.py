@@ -43,6 +43,7 @@ class Spectrum:
     gain_accuracy: float = 0.0  # the reading's scale in this recording, relative standard deviation
     hum: tuple[tuple[float, float], ...] | None = None  # frequency, Hz, and amplitude of tones taken out where they can be told
     drift: float = 0.0  # size of what was taken out of the reading as a drift of this recording alone
+    zero: float = 0.0  # deviation of a zero that this recording has for itself
     start: np.ndarray | None = None  # decaying motion of an unsettled start, taken out of the reading, (samples,)
 
     @property
@@ -112,6 +113,7 @@ def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMON
         systematic=systematic_deviations(lines, drive_lines, frequency, drive_step, columns.get(output, {}), float(np.ptp(y))),
         gain_accuracy=float(columns.get(output, {}).get("gain_accuracy", 0.0)), hum=recording.origin.get("hum"),
         drift=float(recording.origin.get("drift", 0.0)),
+        zero=float(recording.origin.get("zero", 0.0)),
     )  # fmt: skip
 
 
@@ -233,7 +235,7 @@ def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
         away = np.abs(np.arange(count) * spectrum.frequency - tone)
         left = np.where(away < 0.6 * lowest, 1.0, 0.25 * np.minimum(1.0, lowest / (np.pi * np.maximum(away, lowest))))
         variance = variance + (left * amplitude) ** 2 / 4
-    variance[0] += (DRIFT_ZERO * spectrum.drift) ** 2
+    variance[0] += (DRIFT_ZERO * spectrum.drift) ** 2 + spectrum.zero**2
     variance = np.where(np.arange(count) == 0, variance, 0.5 * variance)
     return np.sqrt(variance if spectrum.systematic is None else variance + spectrum.systematic**2)
 

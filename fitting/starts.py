@@ -149,6 +149,22 @@ def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
     return root * np.roll(np.where(found < 0, -1.0, 1.0), top)
 
 
+def agreeing(ranges, turned) -> list[int]:
+    """Places of the loops, slowest first, whose M turns its sign or does not as slower ones say; the slowest know best.
+
+    `ranges`: (lowest, highest) drive of each; `turned`: whether its M was found to change sign, which it does in a loop that
+    holds one where it does. The resonance's and the eddy currents' start values blur a fast loop's passage through zero.
+    """
+    kept = []
+    for k, (low, high) in enumerate(ranges):
+        margin = 0.02 * (high - low)
+        inside = [j for j in kept if low <= ranges[j][0] + margin and high >= ranges[j][1] - margin]
+        around = [j for j in kept if low >= ranges[j][0] - margin and high <= ranges[j][1] + margin]
+        if not (any(turned[j] for j in inside) and not turned[k]) and not (any(not turned[j] for j in around) and turned[k]):
+            kept.append(k)
+    return kept
+
+
 def equation_error_start(basis, spectra, deviations, actuator, solve, max_frequency=None, rest=None):
     """Density unknowns and the bottom of M from the slower half of the recordings: (x, bottom / total, misfit).
 
@@ -159,6 +175,8 @@ def equation_error_start(basis, spectra, deviations, actuator, solve, max_freque
     chosen = order[: max(2, (len(order) + 1) // 2)] if max_frequency is None else order
     spectra = [spectra[k] for k in chosen]
     loops = inferred_loops(spectra, [deviations[k] for k in chosen], actuator)
+    drives = [s.drive_at(np.arange(200) / 200) for s in spectra]
+    loops = [loops[k] for k in agreeing([(d.min(), d.max()) for d in drives], [bool(M.min() < 0) for _, M, _ in loops])]
     rows, values = [], []
     for H, M, trust in loops:
         step = (basis.high - basis.low) / basis.size

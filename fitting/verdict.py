@@ -27,6 +27,7 @@ CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: r
 WELL_FORETOLD = (10.0, 0.05)  # misfit of a check recording from which, and the share of it up to which, FULL_SHARE is enough
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
+ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
@@ -187,6 +188,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     else:
         found = _attributed(evidence, common, effects, swap, asked)
     form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
+    form += "".join(ZEROS_TEXT.format(e.amplitude) for e, _ in evidence.adopted if e.shapes.get("zeros"))
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
 
 
@@ -213,7 +215,10 @@ def _found(evidence):
     last group."""
     effects, groups, sizes, last = [], [], {}, []
     for effect, rivals in evidence.adopted:
-        if rivals:
+        same = next((e for e in effects if e["name"] == effect.name), None)
+        if same:  # within recordings and between them
+            same["parameters"] |= _record_row(effect)["parameters"]
+        elif rivals:
             groups.append([effect.name, *[r.name for r in rivals]])
             sizes |= {r.name: _record_row(r)["parameters"] for r in (effect, *rivals)}
         else:
@@ -325,8 +330,9 @@ def _sizes(name, result) -> dict:
 def _record_row(effect) -> dict:
     kind = CLASSES[effect.name]
     info = kind.parameters()[kind.amplitude]
+    size, unit = ("between_recordings", "m") if effect.shapes.get("zeros") else (kind.amplitude, info.unit)
     return {
         "name": effect.name, "block": kind.block,
-        "parameters": {kind.amplitude: {"value": effect.amplitude, "stderr": effect.stderr, "unit": info.unit}},
+        "parameters": {size: {"value": effect.amplitude, "stderr": effect.stderr, "unit": unit}},
         "confidence": float(np.clip(1 - np.exp(-abs(effect.z) / 4), 0, 0.99)), "shifts": {},
     }  # fmt: skip

@@ -18,7 +18,8 @@ class ParameterInfo:
     """What is known about a physical parameter besides its value.
 
     `scale` is a typical size (same unit), `null` the value at which an effect vanishes, `shape` marks a parameter that
-    means nothing while its effect is at null (a time constant, an exponent), `typical` an expected range.
+    means nothing while its effect is at null (a time constant, an exponent), `detail` one of these that the search frees only
+    where its effect leaves a misfit, `typical` an expected range.
     """
 
     unit: str
@@ -28,6 +29,7 @@ class ParameterInfo:
     scale: float = 1.0
     null: float | None = None
     shape: bool = False
+    detail: bool = False
     typical: tuple[float, float] | None = None
     default: float = 0.0
 
@@ -42,10 +44,10 @@ def in_numpy(module):
     return jax.tree.map(np.asarray, module)
 
 
-def param(default, unit, meaning, low=-math.inf, high=math.inf, scale=None, null=None, shape=False, typical=None):
+def param(default, unit, meaning, low=-math.inf, high=math.inf, scale=None, null=None, shape=False, detail=False, typical=None):
     """Declare a physical parameter as an Equinox field; see `ParameterInfo` for the arguments."""
     size = scale if scale is not None else (abs(default) if default else 1.0)
-    info = ParameterInfo(unit, meaning, low, high, size, null, shape, typical, default)
+    info = ParameterInfo(unit, meaning, low, high, size, null, shape, detail, typical, default)
     return eqx.field(default_factory=lambda: as_float_array(default), converter=as_float_array, metadata={"param": info})
 
 

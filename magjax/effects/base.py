@@ -12,6 +12,7 @@ displacement    mechanics               the displacement (whole signal)
 reading         sensor                  the reading (whole signal; `line.time` runs over the record for `record_level` ones)
 """
 
+import dataclasses
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -75,6 +76,19 @@ class AbstractEffect(eqx.Module):
     def parameters(cls):
         """Declared parameters: name -> ParameterInfo."""
         return parameters_of(cls)
+
+    def free_parameters(self) -> tuple[str, ...]:
+        """Names of what a fit frees: all but the details of the law, while these are at their defaults."""
+        known = self.parameters()
+        plain = all(float(getattr(self, n)) == info.default for n, info in known.items() if info.detail)
+        return tuple(n for n, info in known.items() if not (plain and info.detail))
+
+    def in_detail(self):
+        """The same with the details of its law free, off zero by their scale; None where it has none or they are free already."""
+        kept = {n: info for n, info in self.parameters().items() if info.detail}
+        if not kept or set(kept) & set(self.free_parameters()):
+            return None
+        return dataclasses.replace(self, **{n: info.scale for n, info in kept.items() if info.default == 0})
 
     @property
     def marches(self) -> bool:

@@ -13,9 +13,9 @@ PASSES = 3  # over a period; each begins with the steady response to the frictio
 
 
 class CoulombFriction(AbstractEffect):
-    """Friction as an equivalent displacement F/k: Dahl's law, viscous below a velocity, solved sample by sample.
+    """Friction as an equivalent displacement F/k: Dahl's law, viscous below a velocity, and LuGre's rise towards rest.
 
-    It may exceed what the rod's stiffness moves within the presliding, so that the rod sticks at its turns. The way of
+    Solved sample by sample. It may exceed what the rod's stiffness moves within the presliding, so that the rod sticks at its turns. The way of
     presliding is taken as f/50 at least.
     """
 
@@ -25,6 +25,19 @@ class CoulombFriction(AbstractEffect):
     )
     presliding: Float[Array, ""] = param(
         3e-8, "m", "way over which friction turns with the motion", low=0.0, scale=1e-7, shape=True, typical=(1e-9, 1e-5)
+    )
+    stribeck: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "by how much more friction there is near rest (Stribeck)",
+        low=0.0,
+        scale=0.1,
+        shape=True,
+        detail=True,
+        typical=(0.0, 1.0),
+    )
+    v_stribeck: Float[Array, ""] = param(
+        1e-3, "m/s", "velocity over which that falls", low=1e-6, scale=1e-3, shape=True, detail=True, typical=(1e-4, 1e-1)
     )
 
     name = "coulomb_friction"
@@ -48,24 +61,28 @@ class CoulombFriction(AbstractEffect):
         reach = self.f * rise[0]  # what full friction takes back within the sample
 
         def turned(moved, p):
-            keep = jnp.exp(-(jnp.abs(moved) + slow) / way)
-            aim = jnp.tanh(moved / slow)
-            slope = (1 - aim**2) / slow * (1 - keep) + (aim - p) * keep * jnp.sign(moved) / way
-            return aim + (p - aim) * keep, slope
+            top = 1 + self.stribeck * jnp.exp(-((moved / (line.dt * self.v_stribeck)) ** 2))
+            keep = jnp.exp(-(jnp.abs(moved) + slow) / (way * top))
+            return top * jnp.tanh(moved / slow) * (1 - keep) + p * keep
+
+        def balance(moved, free, p):
+            """moved + reach turned(moved, p) - free, and its slope."""
+            p_there, slope = jax.jvp(lambda m: turned(m, p), (moved,), (jnp.ones_like(moved),))
+            return moved + reach * p_there - free, 1 + reach * slope
 
         def allowed(free, p):
-            """`moved` with moved + reach turned(moved, p) = free: the left side rises, and from the near end Newton only approaches."""
-            at_rest = reach * p * jnp.exp(-slow / way)
+            """`moved` where that is zero; from the near end of where it can be Newton only approaches, but for Stribeck's."""
+            most = reach * (1 + self.stribeck)
+            at_rest = reach * turned(0.0, p)
             ahead = free > at_rest
-            low = jnp.where(ahead, jnp.maximum(free - reach, 0.0), free - at_rest)
-            high = jnp.where(ahead, free - at_rest, jnp.minimum(free + reach, 0.0))
+            low = jnp.where(ahead, jnp.maximum(free - most, 0.0), free - at_rest)
+            high = jnp.where(ahead, free - at_rest, jnp.minimum(free + most, 0.0))
             near = jnp.where(ahead, low, high)
             moved = jnp.where(near == 0, jnp.where(ahead, 1.0, -1.0) * 1e-300, near)
             for _ in range(NEWTON):
-                p_there, slope = turned(moved, p)
-                left = moved + reach * p_there - free
+                left, slope = balance(moved, free, p)
                 low, high = jnp.where(left < 0, moved, low), jnp.where(left < 0, high, moved)
-                step = moved - left / (1 + reach * slope)
+                step = moved - left / slope
                 moved = jnp.where((step >= low) & (step <= high), step, 0.5 * (low + high))
             return moved
 
@@ -74,9 +91,8 @@ class CoulombFriction(AbstractEffect):
             rest = A @ state - (gain - rise) * self.f * p
             free = linear + rest[0] - before
             moved = jax.lax.stop_gradient(allowed(*jax.lax.stop_gradient((free, p))))
-            p_there, slope = turned(moved, p)  # one differentiable step more
-            moved = moved - (moved + reach * p_there - free) / jax.lax.stop_gradient(1 + reach * slope)
-            p = turned(moved, p)[0]
+            left, slope = balance(moved, free, p)  # one differentiable step more
+            p = turned(moved - left / jax.lax.stop_gradient(slope), p)
             state = rest - rise * self.f * p
             return (state, p, linear + state[0]), (p, state[0])
 
