@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import fitting.attribute
 import fitting.search
 from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of
 from fitting.screen import Candidate
@@ -117,7 +118,7 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
 
     monkeypatch.setattr("fitting.task.fit_or_stop", fit)
     monkeypatch.setattr(module, "credited", lambda c, result, *a: dataclasses.replace(best, result=result))
-    best.result.actuator = SimpleNamespace(effect=lambda name: None, effects=())
+    best.result.actuator = SimpleNamespace(effect=lambda name: CLASSES[name](), effects=())
     task = Task((), load_bench("aa-050h"), Choices(rest=held))
     assert task.bench.start == "auto"
     far = trial("creep", 2.0)
@@ -309,3 +310,39 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
     assert fitting.search._exchanged(Task((), None), state, 0) is (name == "excess_loss")
     assert tried == ["excess_loss"] and state.steps[0][0].name == name  # what takes far less is not tried
     assert state.current.chi2_per_sample == min(ends, 1.6)
+
+
+@pytest.mark.parametrize(("leader", "tried"), [(69.0, ["second_mode", "backlash"]), (5.0, ["second_mode"])], ids=["far", "near"])
+def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, leader, tried):
+    """The score of a strong effect is that of its derivative at null, which may look like nothing it does."""
+    ends = {"second_mode": leader, "backlash": 2.0, "creep": 50.0}
+    rows = [candidate("second_mode", 600.0), candidate("backlash", 300.0, (0, 1, 0)), candidate("creep", 100.0, (0, 0, 1))]
+    fitted = lambda task, current, c, excess, target: dataclasses.replace(trial(c.name, ends[c.name], base=100.0), candidate=c)
+    monkeypatch.setattr(fitting.search, "try_effect", fitted)
+    monkeypatch.setattr(fitting.search, "settled", lambda task, current, t, excess, target: t)
+    task = Task((), None, progress=lambda *a: None)
+    current = SimpleNamespace(chi2_per_sample=100.0, data_count=COUNT)
+    assert names(fitting.search._trials(task, current, rows[:1], rows, 99.0 * COUNT)) == tried
+
+
+@pytest.mark.parametrize(("share", "ends", "detailed"), [(0.6, 1.1, True), (0.6, 1.98, False), (0.2, 1.1, False)])
+def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch, share, ends, detailed):
+    class Model:
+        def effect(self, name):
+            return CLASSES[name](f=1e-6)
+
+        def with_effect(self, effect):
+            return effect
+
+    plain = trial("coulomb_friction", 2.0, 3)
+    plain = dataclasses.replace(
+        plain, explained_share=share, result=SimpleNamespace(**vars(plain.result), actuator=Model(), choices=None)
+    )
+    monkeypatch.setattr(
+        fitting.attribute, "credited", lambda c, result, base, effect, excess: trial(c.name, ends, len(effect.free_parameters()))
+    )
+    asked = []
+    task = SimpleNamespace(fit_on=lambda start, effect, **more: asked.append(effect) or SimpleNamespace())
+    found = fitting.attribute.settled(task, SimpleNamespace(spectra=None), plain, 1.0)
+    assert (found is not plain) == detailed and bool(asked) == (share > 0.3)
+    assert all(float(effect.stribeck) > 0 for effect in asked)

@@ -9,12 +9,15 @@ import pytest
 import fitting.diagnose as module
 import fitting.search as search_module
 from fitting.attribute import Trial, chi2_of
+from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
+from fitting.record_level import remove_from_checks
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
+from fitting.spectra import line_deviations
 from fitting.task import Task
 from fitting.verdict import Evidence, _achieved, _found
 from magjax.bench import load_bench
@@ -266,3 +269,35 @@ def test_a_sensors_zero_is_adopted_where_it_scores_best_and_told_of_where_an_eff
     assert found == pytest.approx(zero, abs=1.2e-6) and none is None and freed.chi2_per_sample < base.chi2_per_sample
     better = module._sensor_zero(task, base, [SimpleNamespace(z=2 * score)])
     assert better[0] is base and better[2:] == (None, None)
+
+
+def test_zeros_that_change_from_recording_to_recording_are_told(bench):
+    rng = np.random.default_rng(8)
+    runs = [
+        record(concealed_actuator(bench), *d, rng, f"r{d[0]}")
+        for d in ((10, 0.8, 0.1), (60, 0.5, -0.1), (150, 0.8, 0.1), (300, 0.6, 0.2))
+    ]
+    zeros = 4e-7 * np.array([1.0, -1.0, -0.5, 0.7])
+    moved = [
+        dataclasses.replace(r, channels={**r.channels, "displacement": r.channels["displacement"] + z})
+        for r, z in zip(runs, zeros, strict=True)
+    ]
+    task = Task(tuple(moved), bench, Choices())
+    base = task.fit()
+    cleaned, (effect, rivals), freed = module._own_zeros(task, [], base, ())
+    assert freed.chi2_per_sample < 1.15 < base.chi2_per_sample and effect.z > 8
+    assert effect.name == "zero_drift" and [r.name for r in rivals] == ["thermal_drift"]
+    assert module._own_zeros(cleaned, [(effect, rivals)], freed, ()) is None  # once
+    better = SimpleNamespace(name="creep", z=2 * effect.z)
+    assert module._own_zeros(task, [], base, (better,)) is None
+    s = freed.spectra[0]
+    assert line_deviations(s, s.noise)[0] > 0.5 * s.peak_to_peak and line_deviations(s, s.noise)[1] < 1e-7
+    # of a check recording its zero is not known either
+    check = [dataclasses.replace(moved[1], origin={})]
+    error, apart = (
+        check_errors(base.actuator, freed.actuator, check, bench, c)[0]["rms_after"]
+        for c in (remove_from_checks(check, [effect], bench), check)
+    )
+    assert error < 6e-8 and apart > 2e-7
+    (same,) = module.zeros_of(base.spectra, 9.0, zeros, zeros, ["zero_drift"])  # of what drifts within them there is no rival
+    assert same.name == "zero_drift"

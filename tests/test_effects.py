@@ -91,15 +91,16 @@ def test_a_limited_voltage_bounds_the_current():
 
 
 @pytest.mark.parametrize(
-    "f,v_s,presliding,tolerance",
-    [(4e-7, 1e-7, 3e-7, 0.02), (4e-7, 1e-7, 2e-6, 0.02), (4e-7, 1e-3, 1e-8, 0.03), (2e-6, 1e-5, 1e-7, 0.02)],
-    ids=["Dahl", "Dahl wide", "viscous", "sticks"],
+    "f,v_s,presliding,stribeck,tolerance",
+    [(4e-7, 1e-7, 3e-7, 0, 0.02), (4e-7, 1e-7, 2e-6, 0, 0.02), (4e-7, 1e-3, 1e-8, 0, 0.03), (2e-6, 1e-5, 1e-7, 0, 0.02)]
+    + [(4e-7, 1e-7, 1e-6, 0.5, 0.02)],
+    ids=["Dahl", "Dahl wide", "viscous", "sticks", "LuGre"],
 )
-def test_friction_against_its_equation_in_time(f, v_s, presliding, tolerance):
+def test_friction_against_its_equation_in_time(f, v_s, presliding, stribeck, tolerance):
     from scipy.integrate import solve_ivp
 
     act = actuator(20)
-    effect = effects.CoulombFriction(f=f, v_s=v_s, presliding=presliding)
+    effect = effects.CoulombFriction(f=f, v_s=v_s, presliding=presliding, stribeck=stribeck, v_stribeck=2e-3)
     signals = simulate(act.with_effect(effect), CURRENT, DT, periodic=True)
     free = np.asarray(signals.free_displacement)
     w, xi = 2 * np.pi * float(act.mechanics.f0), float(act.mechanics.xi)
@@ -108,7 +109,8 @@ def test_friction_against_its_equation_in_time(f, v_s, presliding, tolerance):
 
     def rate(t, state):
         y, v, p = state
-        return [v, w * w * (pull(t) - y - f * p) - 2 * xi * w * v, (abs(v) + v_s) * (np.tanh(v / v_s) - p) / presliding]
+        top = 1 + stribeck * np.exp(-((v / 2e-3) ** 2))
+        return [v, w * w * (pull(t) - y - f * p) - 2 * xi * w * v, (abs(v) + v_s) * (np.tanh(v / v_s) - p / top) / presliding]
 
     exact = solve_ivp(rate, (0, times[-1]), [free[0], 0, 0], "LSODA", times, rtol=1e-7, atol=1e-12, max_step=DT).y[0, 3 * N : 4 * N]
     without = np.asarray(simulate(act, CURRENT, DT, periodic=True).displacement)
@@ -131,6 +133,28 @@ def test_a_rod_that_sticks_stays_calm_on_a_coarse_grid():
 
     coarse, fine = lost(125), lost(2000)
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.04 * np.sqrt(np.mean(fine**2))
+
+
+def test_creep_weighs_its_lags_by_a_power_of_time():
+    line, signal = Timeline(jnp.asarray(1e-3), 200, True), jnp.sin(2 * jnp.pi * jnp.arange(200) / 200)  # 5 Hz
+    s = 2j * np.pi * 5
+    for exponent in (0.0, 0.3, -0.3):
+        effect = effects.Creep(gain=0.1, shortest=2e-3, exponent=exponent)
+        got = np.fft.rfft(np.asarray(effect.displacement(signal, signal, None, line, None)))[1] / np.fft.rfft(np.asarray(signal))[1]
+        tau = np.logspace(np.log10(2e-3), 2, 20001)
+        lost = np.trapezoid((tau / 0.1) ** exponent * s * tau / (1 + s * tau), np.log10(tau))
+        assert got == pytest.approx(1 - 0.1 * lost, abs=1e-5)
+        if exponent == 0:
+            assert lost == pytest.approx(-np.log10((1 + s * 2e-3) / (1 + s * 100)), rel=1e-6)
+
+
+def test_details_of_a_law_are_held_until_they_are_asked_for():
+    friction = effects.CoulombFriction(f=1e-6)
+    assert friction.free_parameters() == ("f", "v_s", "presliding")
+    finer = friction.in_detail()
+    assert set(finer.free_parameters()) == set(friction.parameters()) and float(finer.stribeck) > 0 and float(finer.f) == 1e-6
+    assert finer.in_detail() is None and effects.Backlash().in_detail() is None
+    assert "exponent" not in effects.Creep().free_parameters() and float(effects.Creep().in_detail().exponent) != 0
 
 
 def test_smooth_friction_approaches_coulomb():

@@ -20,7 +20,7 @@ from fitting.recipe import recipe_beside
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
-from fitting.starts import operator_rows, unfold
+from fitting.starts import agreeing, operator_rows, unfold
 from magjax.bench import load_bench
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.preisach import Preisach, density_masses
@@ -384,3 +384,10 @@ def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
     problem = SimpleNamespace(layout=SimpleNamespace(nonnegative=np.zeros(2, bool)), data_count=1000)
     found = joint.solve(problem, np.asarray([2.0, 0.5]), np.ones(1))
     assert found.jacobians < 12 if most[0] == 4 else found.jacobians == 30
+
+
+def test_a_fast_loop_passes_zero_where_slower_ones_do():
+    wide, narrow = (-1.0, 1.0), (-0.6, 0.6)
+    assert agreeing([wide, narrow, wide, wide], [True, False, False, True]) == [0, 1, 3]  # the third must turn as the first does
+    assert agreeing([wide, narrow], [False, True]) == [0]  # inside a loop that does not turn none does
+    assert agreeing([narrow, wide], [False, True]) == [0, 1] and agreeing([narrow, wide], [True, False]) == [0]
