@@ -148,12 +148,30 @@ def test_creep_weighs_its_lags_by_a_power_of_time():
             assert lost == pytest.approx(-np.log10((1 + s * 2e-3) / (1 + s * 100)), rel=1e-6)
 
 
+def test_backlash_in_detail_is_a_mean_of_plays_beside_an_elastic_path():
+    y = 1e-5 * np.sin(2 * np.pi * np.arange(400) / 400)
+    line = Timeline(jnp.asarray(1e-3), 400, True)
+
+    def play(width):
+        state, out = 0.0, []
+        for value in np.tile(y, 3):
+            state = min(max(state, value - width), value + width)
+            out.append(state)
+        return np.asarray(out[-400:])
+
+    for spread, elastic in ((0.0, 0.0), (0.4, 0.15)):
+        effect = effects.Backlash(gap=9e-7, spread=spread, elastic=elastic)
+        plays = np.mean([play(9e-7 * (1 + spread * c)) for c in (-1, -0.5, 0, 0.5, 1)], axis=0)
+        got = np.asarray(effect.displacement(jnp.asarray(y), None, None, line, None))
+        assert np.abs(got - (y + (1 - elastic) * (plays - y))).max() < 1e-18
+
+
 def test_details_of_a_law_are_held_until_they_are_asked_for():
     friction = effects.CoulombFriction(f=1e-6)
     assert friction.free_parameters() == ("f", "v_s", "presliding")
     finer = friction.in_detail()
     assert set(finer.free_parameters()) == set(friction.parameters()) and float(finer.stribeck) > 0 and float(finer.f) == 1e-6
-    assert finer.in_detail() is None and effects.Backlash().in_detail() is None
+    assert finer.in_detail() is None and effects.DeltaE().in_detail() is None
     assert "exponent" not in effects.Creep().free_parameters() and float(effects.Creep().in_detail().exponent) != 0
 
 

@@ -185,8 +185,8 @@ def _inside(actuator, s) -> dict:
     return found
 
 
-def of_checks(before, after, recordings, bench) -> dict:
-    """Measured and predicted periods of check recordings, before and after a repair."""
+def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict:
+    """Measured and predicted periods of check recordings, before and after a repair; `own_zeros`: which leaves each its level."""
     from ..spectra import reduce_recording
 
     found = {}
@@ -203,7 +203,8 @@ def of_checks(before, after, recordings, bench) -> dict:
         for key, actuator in (("before", before), ("after", after)):
             reading = np.asarray(steady(actuator, s).reading)
             predicted = np.interp(phases, np.arange(len(reading) + 1) / len(reading), np.append(reading, reading[0]))
-            entry[key] = predicted - (predicted.mean() - measured.mean()) * (bench.output == "flux_density")
+            levelled = bench.output == "flux_density" or (own_zeros and key == "after")
+            entry[key] = predicted - (predicted.mean() - measured.mean()) * levelled
         found[str(k)] = entry
     return found
 

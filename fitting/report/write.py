@@ -52,7 +52,8 @@ def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduc
         if repaired is not None:
             found["repaired"] = evidence.of_fit(repaired, chosen=[int(k) for k in found["base"]["chosen"]])
         if checks:
-            found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench)
+            own_zeros = any(s.zero for s in best.spectra)
+            found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench, own_zeros)
     store.save(folder, found)
     rebuild(folder, progress)
 

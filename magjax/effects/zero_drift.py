@@ -15,7 +15,7 @@ class ZeroDrift(AbstractEffect):
     block = "sensor"
     law = "reading = y + rate t"
     source = "warm-up of sensor electronics"
-    signature = "a ramp through every record, whatever the drive: at one rate, or of each record by itself, bent as warming up is"
+    signature = "a ramp through every record, whatever the drive: at one rate, or of each record by itself, bent as warming up is; or another level in each"
     amplitude = "rate"
     record_level = True
 
