@@ -133,7 +133,10 @@ def _in_detail(task, base, trial, excess) -> Trial:
     effect = result.actuator.effect(trial.name).in_detail()
     if effect is None:
         return trial
-    finer = task.fit_on(result, result.actuator.with_effect(effect), choices=result.choices, spectra=base.spectra)
+    same = {"choices": result.choices, "spectra": base.spectra}
+    finer = task.fit_on(result, result.actuator.with_effect(effect), **same)
+    if not finer.converged:
+        finer = task.fit_on(finer, finer.actuator, **same)
     finer = credited(trial.candidate, finer, base, effect, excess)
     return finer if finer.bic_change < trial.bic_change - BIC_DROP else trial
 

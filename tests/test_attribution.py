@@ -342,7 +342,7 @@ def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch
         fitting.attribute, "credited", lambda c, result, base, effect, excess: trial(c.name, ends, len(effect.free_parameters()))
     )
     asked = []
-    task = SimpleNamespace(fit_on=lambda start, effect, **more: asked.append(effect) or SimpleNamespace())
+    task = SimpleNamespace(fit_on=lambda start, effect, **more: asked.append(effect) or SimpleNamespace(converged=True))
     found = fitting.attribute.settled(task, SimpleNamespace(spectra=None), plain, 1.0)
     assert (found is not plain) == detailed and bool(asked) == (share > 0.3)
     assert all(float(effect.stribeck) > 0 for effect in asked)
