@@ -15,8 +15,8 @@ PASSES = 3  # over a period; each begins with the steady response to the frictio
 class CoulombFriction(AbstractEffect):
     """Friction as an equivalent displacement F/k: Dahl's law, viscous below a velocity, and LuGre's rise towards rest.
 
-    Solved sample by sample. It may exceed what the rod's stiffness moves within the presliding, so that the rod sticks at its turns. The way of
-    presliding is taken as f/50 at least.
+    Solved sample by sample. It may exceed what the rod's stiffness moves within the presliding, so that the rod sticks at
+    its turns. The way of presliding is taken as f/50 at least.
     """
 
     f: Float[Array, ""] = param(0.0, "m", "friction force over stiffness", low=0.0, scale=1e-7, null=0.0, typical=(1e-8, 5e-6))
@@ -43,7 +43,8 @@ class CoulombFriction(AbstractEffect):
     name = "coulomb_friction"
     block = "mechanics"
     law = (
-        "force -k f p, dp/dt = (|y'| + v_s)(tanh(y'/v_s) - p)/presliding; Dahl's law as v_s -> 0, Coulomb's as presliding -> 0 too"
+        "force -k f p, dp/dt = (|y'| + v_s)(tanh(y'/v_s) - p/S)/presliding, S = 1 + stribeck exp(-(y'/v_stribeck)^2); LuGre's law as "
+        "v_s -> 0, Dahl's without stribeck, Coulomb's as presliding -> 0 too"
     )
     source = "P. R. Dahl (1968); C. Canudas de Wit et al., IEEE Trans. Autom. Control 40 (1995) 419, and references there"
     signature = "a step at each turning point, of the same size at every amplitude and frequency"
