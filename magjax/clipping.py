@@ -18,6 +18,7 @@ MOST_JUDGED = 16  # crests, evenly over the record
 ARCH = 4.0  # hidden height in tolerances; one where the crest is a parabola, two for t^4
 LARGEST = 0.021  # tolerance in spans: above it noise hides what a crest is like
 CORNER = 0.5  # slope beside the plateau over that farther off; 0.75 where a sine is cut, 0.4 for t^4, less where it saturates
+SEEN = 1e-4  # of the span: less noise hides no crest
 NOISY = 1.5  # counts of noise, rms: from here on values seldom come back
 TIED, TIED_MORE = 8, 4.0  # samples that equal the extreme, and how many times as often as a level near it
 STUCK = 10  # equal samples in a row
@@ -59,8 +60,9 @@ def _in_noise(values: np.ndarray) -> float:
     """The fast noise of a channel, (time,), most of which moves by more than `NOISY` counts of it; 0 of others."""
     if len(values) < 4 * FEWEST:
         return 0.0
-    noise = float(np.quantile(np.abs(np.diff(values, 4)), 0.25) / (0.3186 * np.sqrt(70)))
-    return noise if noise > max(NOISY * quantum(values), 1e-7 * np.ptp(values)) else 0.0
+    # by eighth differences: a smooth signal has none to speak of, down to ten samples a swing
+    noise = float(np.quantile(np.abs(np.diff(values, 8)), 0.25) / (0.3186 * np.sqrt(12870)))
+    return noise if noise > max(NOISY * quantum(values), SEEN * np.ptp(values)) else 0.0
 
 
 def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarray | None = None):

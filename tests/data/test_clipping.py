@@ -102,6 +102,13 @@ def test_crests_cut_with_their_noise_by_little_are_clipped(bits):
     assert is_clipped(counted(np.minimum(x, level), bits)) and not is_clipped(counted(x, bits))
 
 
+@pytest.mark.parametrize("samples", [12, 20, 50, 200])
+def test_a_sine_without_noise_reaches_its_crest_in_every_period(samples):
+    x = np.sin(2 * np.pi * (np.arange(40 * samples) % samples) / samples)
+    x[7 * samples : 7 * samples + 2] += 1e-3
+    assert np.sum(x == x.max()) >= 40 and not is_clipped(x) and stuck_stretch(x) is None
+
+
 def test_few_counts_on_a_small_sine_are_no_plateau():
     step = 2.0 / 2**15
     x = -0.3 + 0.274 * np.sin(2 * np.pi * (phases(1000, 4)))  # seven samples on one count at its lowest
