@@ -11,13 +11,14 @@ import numpy as np
 from magjax.bench import load_bench
 
 from .alternation import alternating
-from .attribute import MIN_DROP, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
+from .attribute import MIN_DROP, MISFIT, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
 from .fit import FINER_FROM, REFINE_BELOW, finer_than
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import with_learned_term
 from .locate import where
 from .on_lines import hum_score, offset_score, zeros_score
+from .reach import BEYOND
 from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect, zeros_of
 from .search import SECOND_Z, screened, search
 from .setup import Choices, spectra_of, with_held_masses
@@ -27,6 +28,7 @@ from .verdict import (
     FULL_SHARE,
     ROUGH_CHI2,
     SILENT_CHI2,
+    WORSE,
     Z_THRESHOLD,
     Diagnosis,
     Evidence,
@@ -45,6 +47,7 @@ LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the d
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
 COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
+MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -70,11 +73,16 @@ def diagnose(
     if known := known_instruments(recordings, calibration, bench):
         return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
     task = Task(tuple(recordings), bench, choices, progress, actuator)
+    return _with_missed_check(task, _diagnosed(task, check), check)
+
+
+def _diagnosed(task, check) -> Diagnosis:
+    """The diagnosis of the task's recordings, whose instruments are not known from channels of their own."""
+    recordings, bench, choices = list(task.recordings), task.bench, task.choices
     task.say("between the harmonics")
     spectra = spectra_of(recordings, bench, choices.harmonics)
     if alternation := alternating(recordings, spectra, bench.output):
-        asked = {"check": check, "actuator": actuator, "choices": choices, "progress": progress}
-        return alternation.told(diagnose(alternation.cleaned, bench, **asked))
+        return alternation.told(_diagnosed(task.on(recordings=tuple(alternation.cleaned)), check))
     problem = data_problem(recordings, spectra, bench.output)
     adopted, cleaned = _record_level(recordings, spectra, bench, choices)
     if problem and (not adopted or data_problem(cleaned, spectra_of(cleaned, bench, choices.harmonics), bench.output)):
@@ -84,6 +92,41 @@ def diagnose(
         return found
     names = " and ".join(effect.name for effect, _ in adopted)
     return dataclasses.replace(found, message=f"{found.message} As recorded, before {names} was taken out: {problem}.")
+
+
+def _with_missed_check(task, found, check) -> Diagnosis:
+    """The diagnosis; where the fit meets its noise and misses a check recording by far, that one joins the recordings, if
+    others are left to check: what it shows they may not reach. What is named with it must foretell the others no worse.
+    """
+    final = found.repaired or found.base
+    known = found.verdict in ("attributed", "group", "nothing_missing") and not any(r.get("joined") for r in found.check)
+    if not known or not final.chi2_per_sample < MISFIT or len(found.check) != len(check):
+        return found
+    ratios = [r["rms_after"] / r["noise_rms"] if r["noise_rms"] and not r["beyond_plane"] > BEYOND else 0.0 for r in found.check]
+    if not max(ratios, default=0.0) > MISSED:
+        return found
+    worst = int(np.argmax(ratios))
+    missed, left = check[worst], [c for k, c in enumerate(check) if k != worst]
+    name = missed.origin.get("file", missed.name).rsplit("/", 1)[-1]
+    told = f"{name} is missed by {ratios[worst]:.0f} times its noise, though the fit meets its own"
+    if not left:
+        return found.noted(f"{told}: the recordings do not reach what it shows; give it as one of them, and others to check.")
+    task.say(f"with {name} among the recordings")
+    again = _diagnosed(task.on(recordings=(*task.recordings, missed)), left)
+    rest = [r for k, r in enumerate(found.check) if k != worst]
+    met = again.verdict in ("attributed", "group") and again.repaired.chi2_per_sample < MISFIT
+    before, after = misfit(rest, "rms_after"), misfit(again.check, "rms_after")
+    if not met or not _says_more(again, found) or after > WORSE[0] * before + WORSE[1] * len(rest):
+        return found.noted(f"{told}: the recordings do not reach what it shows, a density or physics; record more like it.")
+    row = {**found.check[worst], "rms_after": again.repaired.recordings[-1].residual_rms, "joined": True}
+    again = dataclasses.replace(again, check=(*again.check[:worst], row, *again.check[worst:]))
+    return again.noted(f"Without it among the recordings {told}; it joined them.")
+
+
+def _says_more(again, found) -> bool:
+    """Whether a diagnosis names more, or the same with fewer doubts."""
+    number, before = (len(d.effects) + len(d.groups) for d in (again, found))
+    return number > before or (number == before and len(again.groups) < len(found.groups))
 
 
 def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
@@ -105,9 +148,15 @@ def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
     checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
     plain, candidates = _screened_finer(task, plain, candidates, free)
     place = where(plain, candidates, task.recordings, task.bench.output)
-    reached = search(task, plain, candidates, checks[1])
-    if reached.steps and (found := _hum_on_harmonics(task, adopted, reached.current)):
-        cleaned, hum, _ = found
+    hummed = []
+
+    def hums(current) -> bool:
+        hummed[:] = [found for found in [_hum_on_harmonics(task, adopted, current)] if found]
+        return bool(hummed)
+
+    reached = search(task, plain, candidates, checks[1], hums)
+    if hummed:  # beside an effect: begun anew without it
+        cleaned, hum, _ = hummed[0]
         return _examined(cleaned, measured, [*adopted, hum], check)
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,

@@ -69,9 +69,9 @@ class Reached:
     form: str | None = None
 
 
-def search(task, base, candidates, check=()) -> Reached:
+def search(task, base, candidates, check=(), ends=lambda current: False) -> Reached:
     """Forward: fit the leaders, adopt the best while it earns its place; then screen again. `task`: a `Task`, of what
-    `base` was fitted to."""
+    `base` was fitted to; `ends(fit)`: whether the fit with an effect that was adopted makes the rest of the search needless."""
     state = Reached(base, [], {})
     scored = {c.name: c for c in candidates}
     any_rest = task.choices.rest == "auto"
@@ -108,11 +108,15 @@ def search(task, base, candidates, check=()) -> Reached:
         state.steps.append((best, rivals_of(best, good), good, state.current))
         state.current = best.result
         let_go()
+        if ends(state.current):
+            return state
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         _backward(task, state)
         _exchange(task, state)
         if _commuted(task, state, scored.get("sensor_lag")):
             _exchange(task, state)
+    if state.steps and state.current is not state.steps[-1][0].result:
+        ends(state.current)
     return state
 
 

@@ -58,12 +58,16 @@ class Diagnosis:
     def __str__(self):
         return f"{self.verdict}: {self._said()}"
 
+    def noted(self, note: str) -> "Diagnosis":
+        """The same with a further sentence."""
+        return dataclasses.replace(self, message=f"{self.message} {note}")
+
     def without_checks(self, refused) -> "Diagnosis":
         """The same with a word on check recordings that could not be used; `refused`: a sentence for each."""
         if not refused:
             return self
         noted = " ".join(f"Left out of the checks: {why}." for why in refused)
-        return dataclasses.replace(self, message=f"{self.message} {noted}", check_left_out=tuple(refused))
+        return dataclasses.replace(self.noted(noted), check_left_out=tuple(refused))
 
     def _said(self) -> str:
         """The message, and where check recordings ask for more than was fitted."""

@@ -1,15 +1,23 @@
 """Check recordings: predictions, and a word where their drive leaves the plane that was fitted."""
 
+import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import fitting.diagnose as module
 from fitting.check import beyond_plane, check_errors
+from fitting.demo import concealed_actuator, record
+from fitting.diagnose import diagnose
 from fitting.reach import beyond_text
 from fitting.report.tables import checks
+from fitting.setup import Choices
+from fitting.task import Task
 from fitting.verdict import Diagnosis
 from magjax.bench import load_bench
+from magjax.effects import AmplifierClipping
 from magjax.errors import ConfigurationError
 from magjax.recording import Recording
 from magjax.simulate import simulate
@@ -45,3 +53,89 @@ def test_a_simulation_still_refuses_unless_told_to_saturate():
         simulate(actuator, drive, 1e-4)
     magnetization = np.asarray(simulate(actuator, drive, 1e-4, outside="saturate").magnetization)
     assert np.all(np.isfinite(magnetization)) and magnetization.max() == pytest.approx(7.87e5, rel=1e-3)
+
+
+def missed(*ratios, verdict="attributed", chi2=0.9, effects=("creep",), groups=(), **more):
+    """A diagnosis whose check recordings end at `ratios` of their noise."""
+    fitted = SimpleNamespace(chi2_per_sample=chi2, recordings=(SimpleNamespace(residual_rms=4.2e-8),))
+    rows = [
+        {"file": f"runs/c{k}.csv", "rms_before": 9e-7, "rms_after": 4e-8 * r, "noise_rms": 4e-8, "beyond_plane": 0.0} | more
+        for k, r in enumerate(ratios)
+    ]
+    named = tuple({"name": n} for n in effects)
+    return Diagnosis(verdict, "So.", effects=named, groups=groups, check=tuple(rows), base=fitted, repaired=fitted)
+
+
+CHECKS = [recording(0.5, f"c{k}.csv") for k in range(3)]
+BOTH = ("creep", "amplifier_clipping")
+
+
+def with_missed(monkeypatch, found, again, check=CHECKS):
+    asked = []
+
+    def diagnosed(task, left):
+        asked.append(([r.name for r in task.recordings], [c.name for c in left]))
+        return again
+
+    monkeypatch.setattr(module, "_diagnosed", diagnosed)
+    task = Task((recording(0.8, "fit.csv"),), load_bench("aa-050h"), Choices())
+    return module._with_missed_check(task, found, check), asked
+
+
+def test_a_check_missed_by_far_joins_the_recordings_where_more_is_named_with_it(monkeypatch):
+    found, asked = with_missed(monkeypatch, missed(1, 13, 2), missed(1, 1.5, effects=BOTH))
+    assert asked == [(["fit.csv", "c1.csv"], ["c0.csv", "c2.csv"])]
+    assert [e["name"] for e in found.effects] == list(BOTH) and "c1.csv is missed by 13 times its noise" in found.message
+    assert [r.get("joined") for r in found.check] == [None, True, None] and found.check[1]["rms_after"] == 4.2e-8
+    # once: what it leaves to check is not asked for again
+    assert with_missed(monkeypatch, found, None)[1] == []
+
+
+@pytest.mark.parametrize(
+    "again",
+    [
+        missed(1, 1),  # names no more
+        missed(4, 3, effects=BOTH),  # foretells the others worse
+        missed(1, 1, effects=BOTH, chi2=1.6),  # does not meet the noise
+        missed(1, 1, effects=(), verdict="unknown_at"),
+    ],
+)
+def test_else_it_is_told(monkeypatch, again):
+    found, asked = with_missed(monkeypatch, missed(1, 13, 2), again)
+    assert len(asked) == 1 and [e["name"] for e in found.effects] == ["creep"]
+    assert found.message.startswith("So. c1.csv is missed by 13 times its noise") and "record more like it" in found.message
+    assert not any("joined" in r for r in found.check)
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        missed(1, 4, 2),  # what a rough density leaves
+        missed(1, 13, 2, chi2=1.5),  # the fit itself has not met its noise
+        missed(1, 13, 2, verdict="unknown_at"),
+        missed(1, 13, 2, beyond_plane=0.2),  # and this is told by another sentence
+        missed(1, 13, 2, noise_rms=0.0),
+    ],
+)
+def test_a_diagnosis_that_it_does_not_concern_stands(monkeypatch, found):
+    assert with_missed(monkeypatch, found, None) == (found, [])
+
+
+def test_the_only_check_recording_never_joins(monkeypatch):
+    found, asked = with_missed(monkeypatch, missed(13), None, CHECKS[:1])
+    assert asked == [] and "give it as one of them, and others to check" in found.message
+
+
+@pytest.mark.long
+def test_physics_that_only_a_check_recording_reaches_is_found():
+    bench, rng = load_bench("aa-050h"), np.random.default_rng(5)
+    truth = concealed_actuator(bench, AmplifierClipping(inverse_limit=0.5, tau_L=1e-3))  # 2 A: asked for at 400 Hz alone
+    drives = ((10, 0.8, 0.1), (30, 0.5, -0.2), (60, 0.8, 0.1), (100, 0.5, -0.2), (150, 0.7, 0.1))
+    runs = [record(truth, *d, rng, f"r{d[0]}") for d in drives]
+    check = [record(truth, *d, rng, f"c{d[0]}") for d in ((80, 0.6, 0.0), (400, 0.85, 0.0), (120, 0.7, 0.05))]
+    assert diagnose(runs, bench, check=[check[0], check[2]]).verdict == "nothing_missing"
+    found = diagnose(runs, bench, check=check)
+    assert "amplifier_clipping" in {e["name"] for e in found.effects} | {n for g in found.groups for n in g}, str(found)
+    assert [r.get("joined") for r in found.check] == [None, True, None]
+    assert all(r["rms_after"] < 1.5 * r["noise_rms"] for r in found.check)
+    assert dataclasses.asdict(found)["message"].endswith("it joined them.")

@@ -200,13 +200,14 @@ def _next(found, names):
 
 
 def _checks(found, evidence, sketch, output, drive):
-    if not found["check"]:
+    rows = [r for r in found["check"] if not r.get("joined")]
+    if not rows:
         return None
     repaired = bool(found["repaired"])
     checks = evidence.get("checks")
-    drawn = sketch(checks, loops.checks, checks, output, drive, found["check"], repaired, added(found))
+    drawn = sketch(checks, loops.checks, checks, output, drive, rows, repaired, added(found))
     title = "Check recordings, before and after" if repaired else "Check recordings"
-    return section(title, part(table=tables.checks(found["check"], repaired)), drawn)
+    return section(title, part(table=tables.checks(rows, repaired)), drawn)
 
 
 def added(found) -> str:

@@ -72,7 +72,7 @@ DIAGNOSIS = {
     "candidates[].smallest_visible": "amplitude that would be seen at five standard deviations",
     "floors": "what limits the residual, in the unit of the channel",
     "where": "where the misfit of the base sits",
-    "check": "one entry a check recording and channel",
+    "check": "one entry a check recording and channel; with `joined`, true, for one that joined the recordings, which did not reach what it shows",
     "check_left_out": "only where a check recording could not be used: a sentence for each",
     "next_experiment": "null, or the recording that best tells the rivals apart",
     "placebo": "null, or how often the same search cries wolf on simulations of the final model (--placebo)",
