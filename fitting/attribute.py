@@ -24,6 +24,7 @@ MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
 BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
 WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
+UNCONFIRMED_TIE = (0.3, 50.0)  # the same where check recordings are missed as far with the best as without
 SAME_DIRECTION = 0.97
 OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law imitates another
 DETAIL_SHARE = 0.3  # of the misfit that an effect takes where the details of its law are tried
@@ -161,8 +162,8 @@ def _physical(effect, result) -> bool:
     return abs(amplitude) <= largest and (amplitude >= 0 or info.low < 0)
 
 
-def rivals_of(best: Trial, trials) -> list[Trial]:
-    """Trials that the data do not tell from the best, the best first.
+def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:
+    """Trials that the data do not tell from the best, the best first; `near`: as `WEAK_TIE`.
 
     By BIC or by AIC, whichever sees them nearer: shapes are held by priors and cost less than BIC charges.
     """
@@ -171,7 +172,7 @@ def rivals_of(best: Trial, trials) -> list[Trial]:
         if t is best or not t.physical:
             continue
         behind = min(t.bic_change - best.bic_change, best.drop - t.drop + 2 * (t.parameters - best.parameters))
-        weak = min(WEAK_TIE[0] * best.drop, WEAK_TIE[1]) if t.result.chi2_per_sample < SETTLED_CHI2 else 0.0
+        weak = min(near[0] * best.drop, near[1]) if t.result.chi2_per_sample < SETTLED_CHI2 else 0.0
         rest = chi2_of(best.result) if best.result.chi2_per_sample > MISFIT else 0.0
         if behind < max(TIE, weak, MISFIT_TIE * rest) or (behind < 2 * TIE and _same(t, best)):
             tied.append(t)

@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.effects import CLASSES
 
-from .attribute import MISFIT, chi2_of, confidence
+from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, confidence, rivals_of
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .instruments import exchange
@@ -25,6 +25,7 @@ ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
 CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: right effects on smooth densities leave less
 WELL_FORETOLD = (10.0, 0.05)  # misfit of a check recording from which, and the share of it up to which, FULL_SHARE is enough
+CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
@@ -179,6 +180,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         return _unknown(evidence, common)
     if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
+    if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
+        evidence = dataclasses.replace(evidence, reached=unconfirmed(evidence.reached))
     effects, groups, sizes, rivals = _found(evidence)
     if not effects and not groups:
         return _silent(evidence, common, dropped, rough)
@@ -194,6 +197,12 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
     form += "".join(ZEROS_TEXT.format(e.amplitude) for e, _ in evidence.adopted if e.shapes.get("zeros"))
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
+
+
+def unconfirmed(reached):
+    """The same with more rivals to the effects found, where check recordings are missed as far with them as without."""
+    steps = [(best, rivals_of(best, good, UNCONFIRMED_TIE), good, previous) for best, _, good, previous in reached.steps]
+    return dataclasses.replace(reached, steps=steps)
 
 
 def _achieved(evidence) -> tuple:

@@ -13,7 +13,7 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
-from fitting.verdict import too_little
+from fitting.verdict import too_little, unconfirmed
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -66,6 +66,18 @@ def test_rivals_are_those_that_the_data_do_not_tell_apart():
     unphysical = trial("excess_loss", 1.19, physical=False)
     assert best.bic_change - by_parameters.bic_change == pytest.approx(0.7 - 2 * np.log(COUNT))
     assert names(rivals_of(best, [best, by_parameters, behind, unphysical])) == ["backlash", "coulomb_friction"]
+
+
+def test_a_name_that_no_check_recording_confirms_has_more_rivals():
+    """As a weak after-effect of another form did, behind structural_damping by 21 in BIC of 185."""
+    best, near, far = (
+        trial("structural_damping", 0.959, base=1.285),
+        trial("magnetic_aftereffect", 1.0, base=1.285),
+        trial("creep", 1.1, base=1.285),
+    )
+    assert names(rivals_of(best, [best, near, far])) == ["structural_damping"]
+    reached = unconfirmed(Reached(best.result, [(best, [best], [best, near, far], None)], {}))
+    assert names(reached.steps[0][1]) == ["structural_damping", "magnetic_aftereffect"]
 
 
 def test_rivals_where_the_best_is_not_the_whole_truth():
