@@ -25,6 +25,12 @@ ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
 CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: right effects on smooth densities leave less
 WELL_FORETOLD = (10.0, 0.05)  # misfit of a check recording from which, and the share of it up to which, FULL_SHARE is enough
+DOMINANT = (
+    0.9,
+    5.0,
+)  # share of a misfit from which an effect is named though it leaves some, if others leave so many times as much
+PROMISES = 8.0  # times the Newton decrement, that going on with a fit may gain at most
+DOMINANT_TEXT = " What is left is the form of its law, or something weaker beside it: no other effect takes nearly as much."
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
@@ -176,6 +182,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
     foretold = before > WELL_FORETOLD[0] * len(rows) and after < WELL_FORETOLD[1] * before
     full = FULL_SHARE if evidence.excess < CLEAN_CHI2 or foretold else FULLER_SHARE
+    alone = dominant(evidence)
+    full = min(full, DOMINANT[0]) if alone else full
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         return _unknown(evidence, common)
     if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
@@ -196,7 +204,25 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         found = _attributed(evidence, common, effects, swap, asked)
     form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
     form += "".join(ZEROS_TEXT.format(e.amplitude) for e, _ in evidence.adopted if e.shapes.get("zeros"))
+    form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
+
+
+def dominant(evidence) -> bool:
+    """Whether the one effect found leaves far less than any other that was fitted in its place: what it leaves is then its
+    law's form. Physics outside the catalogue is taken up by several effects, one about as well as the next."""
+    steps, current = evidence.reached.steps, evidence.reached.current
+    if len(steps) != 1:
+        return False
+    best, _, good, _ = steps[0]
+    tried = [c for c in evidence.reached.tried.values() if c.achieved_chi2_drop is not None and c.name != best.name]
+    left = [chi2_of(evidence.plain) - c.achieved_chi2_drop for c in tried]
+    # of trials that were ended early: what they might have come to
+    left += [
+        chi2_of(t.result) - PROMISES * t.result.solution.decrement for t in good if t.name != best.name and not t.result.converged
+    ]
+    noise = NULL_CHI2 * current.data_count
+    return bool(left) and min(left) - noise > DOMINANT[1] * (chi2_of(current) - noise)
 
 
 def unconfirmed(reached):

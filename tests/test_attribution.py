@@ -13,7 +13,7 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
-from fitting.verdict import too_little, unconfirmed
+from fitting.verdict import dominant, too_little, unconfirmed
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -78,6 +78,25 @@ def test_a_name_that_no_check_recording_confirms_has_more_rivals():
     assert names(rivals_of(best, [best, near, far])) == ["structural_damping"]
     reached = unconfirmed(Reached(best.result, [(best, [best], [best, near, far], None)], {}))
     assert names(reached.steps[0][1]) == ["structural_damping", "magnetic_aftereffect"]
+
+
+@pytest.mark.parametrize(
+    ("second", "ended", "promised", "named"),
+    [(100.0, True, 0.0, True), (7.6, True, 0.0, False), (30.0, False, 2.0, True), (30.0, False, 20.0, False)],
+)
+def test_an_effect_that_leaves_far_less_than_all_others_is_named_whatever_its_form_leaves(second, ended, promised, named):
+    """Right names leave a ninth to a nineteenth of what the next leaves, physics outside the catalogue two thirds to a third."""
+    best, other = trial("coulomb_friction", 3.4, base=245.0), trial("sensor_nonlinearity", second, base=245.0)
+    solution = SimpleNamespace(decrement=promised * COUNT / 8)
+    other = dataclasses.replace(
+        other, result=SimpleNamespace(chi2_per_sample=second, data_count=COUNT, converged=ended, solution=solution)
+    )
+    fitted = {t.name: dataclasses.replace(t.candidate, achieved_chi2_drop=t.drop) for t in (best, other)}
+    plain = SimpleNamespace(chi2_per_sample=245.0, data_count=COUNT)
+    steps = [(best, [best], [best, other], plain)]
+    evidence = SimpleNamespace(reached=Reached(best.result, steps, fitted), plain=plain)
+    assert dominant(evidence) is named
+    assert not dominant(SimpleNamespace(reached=Reached(best.result, 2 * steps, fitted), plain=plain))
 
 
 def test_rivals_where_the_best_is_not_the_whole_truth():
