@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from magjax.bench import load_bench
 from magjax.plausibility import si_unit
 from magjax.simulate import require_x64
 
+from .floors import swapped
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
 from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of, with_held_masses
@@ -27,6 +29,7 @@ REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
 REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be the density
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
+LOST, AT_BOUND = 1e5, 100.0  # chi2/N from which a fit has led nowhere, and one with a parameter at its bound
 VALLEY = 0.98  # correlation from which two parameters are one
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
@@ -245,8 +248,9 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
         + unsettled(problem.spectra)
         + guessed(recordings, bench)
     )
+    lost = not chi2n < LOST or (chi2n > AT_BOUND and any(e.at_bound for e in rows))
     return FitResult(
-        fitted, bench, bool(solution.converged), message, tuple(rows), related, per_recording, float(chi2n), count,
+        fitted, bench, bool(solution.converged) and not lost, message, tuple(rows), related, per_recording, float(chi2n), count,
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
         problem.spectra, choices,
     )  # fmt: skip
@@ -309,6 +313,15 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
     """What the fit means, with its remedy. `limit`: the Jacobians that it was given."""
     if solution.interrupted:
         return f"interrupted after {solution.jacobians} Jacobians; this is what was reached: give it as --model to go on from its constants"
+    if not chi2n < LOST:
+        wrong = swapped(problem.spectra) or "check signs and units of the recordings, and the bench file"
+        named = Path(max(rows, key=lambda r: np.nan_to_num(r.chi2_per_sample, nan=np.inf)).file).name
+        size = (
+            f"the residual is {np.sqrt(chi2n):.3g} times the noise"
+            if np.isfinite(chi2n)
+            else "the simulation fails at its constants"
+        )
+        return f"the fit has led nowhere: {size} (worst: {named}); {wrong}"
     if not solution.converged:
         after = f"stopped after {solution.jacobians} Jacobians before it settled"
         if limit is not None and solution.jacobians < limit:
@@ -317,7 +330,8 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
     worst = max(rows, key=lambda r: r.chi2_per_sample)
     bound = [e.name for e in parameters if e.at_bound]
     if bound:
-        return f"{', '.join(bound)} sits at its bound; free another parameter or check the bench file"
+        far = f", and the residual is {np.sqrt(chi2n):.3g} times the noise (worst: {Path(worst.file).name})" if chi2n > 2 else ""
+        return f"{', '.join(bound)} sits at its bound{far}; free another parameter or check signs, units and the bench file"
     if chi2n < 1.1 and worst.chi2_per_sample < 1.6:
         return "the recordings are met to their noise; the error bars hold"
     if chi2n > 2:

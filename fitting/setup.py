@@ -7,6 +7,7 @@ import numpy as np
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.extrema import nesting
 from magjax.param import in_numpy
+from magjax.recording import NO_ANSWER, follows_nothing
 
 from .density import cell_basis, hat_basis, held_basis
 from .joint import Problem
@@ -46,6 +47,8 @@ def spectra_of(recordings, bench, harmonics: int = HARMONICS):
                 f"{recording.name}: the {recording.drive} does not repeat; a fit needs periodic drives (one whole period at least), "
                 "give this recording with --check instead"
             )
+        if follows_nothing(recording, bench.output):
+            raise RecordingError(f"{recording.name}: {NO_ANSWER.format(channel=bench.output, drive=recording.drive)}")
 
     def reduced(recording):
         return reduce_recording(recording, bench.drive, bench.output, harmonics, bench.columns)

@@ -7,7 +7,7 @@ or polarization. With output = "strain" a table of strain curves is read, no rec
 
 import dataclasses
 import difflib
-import math
+import sys
 import tomllib
 from pathlib import Path
 
@@ -162,7 +162,7 @@ def _check_keys(content, path):
 
 def _number(value, where, path) -> float:
     """A finite number, or the error that names `where` it stands."""
-    finite = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < math.inf  # NaN is not below
+    finite = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max  # nor is NaN
     if not finite:
         raise ConfigurationError(f"bench {path}: {where} = {value!r} must be a finite number, for instance {where} = 1.5")
     return float(value)

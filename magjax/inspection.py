@@ -7,6 +7,7 @@ import numpy as np
 from .clipping import quantum
 from .errors import RecordingError
 from .plausibility import STRONG_FIELD
+from .recording import NO_ANSWER, follows_nothing
 from .terms import DRIVE_UNITS
 
 MOST_FILLED = 0.05  # of the samples: more is no measurement
@@ -73,6 +74,7 @@ def inspect(recording, bench) -> Card:
             if np.ptp(v) / step < 40:
                 problems.append(f"{name} spans only {np.ptp(v) / step:.0f} counts; raise the gain of the converter")
     _judge_gaps(recording, facts, problems, warnings)
+    _judge_clock(recording, warnings)
     if f is None:
         facts["periods"] = "aperiodic: usable as a check recording, not in a fit"
     else:
@@ -81,7 +83,7 @@ def inspect(recording, bench) -> Card:
         _judge_repeats(recording, bench.output, facts, problems)
         if (stated := recording.contradicted_frequency()) is not None:
             warnings.append(
-                f"the header says {stated:g} Hz, the drive repeats at {f:.6g} Hz and is believed; mend `# frequency_Hz`"
+                f"the header says {stated:g} Hz, the drive repeats at {f:.6g} Hz and is believed; " + _clock(stated / f)
             )
         if recording.noise_is_a_guess(bench.output):
             warnings.append(
@@ -107,9 +109,20 @@ def inspect(recording, bench) -> Card:
     return Card(recording.name, facts, tuple(problems), tuple(warnings))
 
 
+def _clock(ratio: float) -> str:
+    """The mend of a header that contradicts the drive: a time column in another unit, or the header itself."""
+    for unit, factor in (("ms", 1e3), ("us", 1e6)):
+        if abs(ratio / factor - 1) < 0.02:
+            return f"its time is in {unit}, it seems: name the column time_{unit}"
+    return "mend `# frequency_Hz`"
+
+
 def _judge_gaps(recording, facts, problems, warnings):
     metadata = recording.origin.get("metadata", {})
-    filled, widest = (int(metadata.get(k) or 0) for k in ("bridged_samples", "widest_gap_samples"))
+    filled, widest = (
+        int(v) if isinstance(v, (int, float)) and 0 < v < 1e12 else 0
+        for v in map(metadata.get, ("bridged_samples", "widest_gap_samples"))
+    )
     if not filled:
         return
     share = filled / len(recording.time)
@@ -137,6 +150,19 @@ def _plane(bench):
     return float(ends[0]), float(ends[1])
 
 
+JITTER = 0.03  # of a step, rms: above it the time axis, taken for uniform, moves the samples along the loop
+
+
+def _judge_clock(recording, warnings):
+    t = np.asarray(recording.time)
+    if len(t) > 3:
+        jitter = float(np.std(t - np.polyval(np.polyfit(np.arange(len(t)), t, 1), np.arange(len(t)))) / recording.dt)
+        if jitter > JITTER:
+            warnings.append(
+                f"the clock jitters by {jitter:.0%} of a step (rms), and is taken for uniform; resample, or time the samples by hardware"
+            )
+
+
 def _judge_repeats(recording, channel, facts, problems):
     y, blocks = np.asarray(recording.channels[channel]), recording.repeats(channel)
     count, per = len(blocks), recording.period_samples()
@@ -145,6 +171,8 @@ def _judge_repeats(recording, channel, facts, problems):
         return
     noise = recording.repeat_noise(channel)
     span = float(np.ptp(y))
+    if follows_nothing(recording, channel):
+        problems.append(NO_ANSWER.format(channel=channel, drive=recording.drive))
     facts["noise from repeats"] = f"{noise:.3g} rms ({noise / span:.2g} of the range)"
     drift = float(blocks[-1].mean() - blocks[0].mean())
     settle = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))

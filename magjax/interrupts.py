@@ -28,6 +28,11 @@ def watched():
             signal.signal(signal.SIGINT, before)
 
 
+def seen() -> bool:
+    """Whether Ctrl-C came."""
+    return _seen.is_set()
+
+
 def raise_if_seen() -> None:
     """Raise `KeyboardInterrupt` where one came and was lost: call it before what cannot be left half done."""
     if _seen.is_set():

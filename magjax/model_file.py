@@ -44,4 +44,15 @@ def _model(content):
     for name in content["effects"]:
         effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else CLASSES[name]()
         actuator = actuator.with_effect(effect)
-    return actuator.replace(content["parameters"]), bench
+    stated = content["parameters"]
+    known = actuator.parameters()
+    if missing := [name for name, (_, info) in known.items() if name not in stated and info.null is None]:
+        raise ConfigurationError(f"parameters lacks {', '.join(missing)}")
+    masses = np.asarray(plane["masses"], float)
+    numbers = {**stated, **{f"hysteresis.{k}": plane[k] for k in ("low", "high", "offset")}, "hysteresis.masses": masses.sum()}
+    if odd := [name for name, value in numbers.items() if not np.isfinite(value)]:
+        raise ConfigurationError(f"{odd[0]} is not a finite number")
+    for name, (_, info) in known.items():
+        if name in stated and not name.startswith("effects.") and not info.low <= stated[name] <= info.high:
+            raise ConfigurationError(f"{name} = {stated[name]:g} is outside {info.low:g} .. {info.high:g}")
+    return actuator.replace(stated), bench

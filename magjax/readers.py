@@ -13,6 +13,11 @@ from .pickup import bridge_gaps, integrate_emf, merge_captures
 from .plausibility import UNITS, ZERO, check_sizes
 from .recording import BYSTANDERS, Recording, refuse_constant
 
+SPELLED = {
+    "ampere": "A", "amperes": "A", "amp": "A", "metre": "m", "meter": "m", "metres": "m", "meters": "m", "second": "s", "seconds": "s",
+    "sec": "s", "millisecond": "ms", "milliseconds": "ms", "micrometre": "um", "micrometer": "um", "micron": "um", "millimetre": "mm",
+    "millimeter": "mm", "tesla": "T", "volt": "V", "volts": "V",
+}  # fmt: skip
 TEXT = (".csv", ".txt", ".dat", ".tsv", "")  # read as CSV
 
 
@@ -22,6 +27,8 @@ def load_recordings(paths, bench) -> list[Recording]:
     Raises `RecordingError` naming file, column and mend.
     """
     bench = load_bench(bench)
+    if bench.output == "strain":
+        raise ConfigurationError('fit.output = "strain" reads a table of strain curves, no recording: give it to magjax diagnose')
     paths = [paths] if isinstance(paths, (str, Path)) else list(paths)
     if not paths:
         raise ConfigurationError("no recording given; name one or several files")
@@ -100,8 +107,10 @@ def _read_table(path: Path) -> list:
         return reader(path) if suffix == ".mjlog" else [reader(path)]
     except MagjaxError:
         raise
-    except (OSError, ValueError, KeyError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read as {suffix[1:] or 'CSV'} ({error})") from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is no text in UTF-8; save it again as CSV in UTF-8") from None
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise RecordingError(f"{path}: cannot be read as {suffix[1:] or 'CSV'} ({error}); save it again, or as CSV") from None
 
 
 def _read_csv(path):
@@ -129,17 +138,36 @@ def _read_csv(path):
         raise RecordingError(f"{path}: rows of unequal length ({str(error).splitlines()[-1].strip()}); mend or cut them") from None
     if values.size == 0:
         raise RecordingError(f"{path}: has a header but no samples; record again")
+    if twice := [n for n in dict.fromkeys(names) if names.count(n) > 1]:
+        raise RecordingError(f"{path}: two columns are named {twice[0]}; rename or remove one")
     if values.shape[1] != len(names):
         raise RecordingError(f"{path}: {len(names)} column names but {values.shape[1]} columns; mend the header row")
     return dict(zip(names, values.T, strict=True)), metadata
 
 
 def _numbers(path, separator, skip):
-    """The rows of numbers: by the fast reader, or by the patient one, which takes empty cells for NaN."""
+    """The rows of numbers: by the fast reader, or by the patient one, which takes empty cells for NaN and decimal commas."""
     try:
         return np.loadtxt(path, delimiter=separator, skiprows=skip, ndmin=2, comments="#", encoding="utf-8-sig")
     except ValueError:
-        return np.genfromtxt(path, delimiter=separator, skip_header=skip, ndmin=2, comments="#", encoding="utf-8-sig")
+        with open(path, encoding="utf-8-sig") as stream:
+            lines = [line.partition("#")[0] for line in stream]
+        if separator != ",":
+            lines = [line.replace(",", ".") for line in lines]
+        _refuse_words(path, lines, separator, skip)
+        return np.genfromtxt(lines, delimiter=separator, skip_header=skip, ndmin=2, comments="#")
+
+
+def _refuse_words(path, lines, separator, skip):
+    """Raise `RecordingError` at the first cell that holds something else than a number."""
+    for k, line in enumerate(lines[skip:], skip + 1):
+        for cell in line.split(separator) if line.strip() else ():
+            try:
+                float(cell.strip().strip('"') or "nan")
+            except ValueError:
+                raise RecordingError(
+                    f'{path}: line {k} holds "{cell.strip()[:30]}", which is no number; one header row, then numbers (put # before other lines)'
+                ) from None
 
 
 def _has_rows(path, skip) -> bool:
@@ -151,12 +179,22 @@ def _has_rows(path, skip) -> bool:
 def _read_netcdf(path):
     import xarray as xr
 
-    with xr.open_dataset(path, engine="h5netcdf") as data:
+    with open(path, "rb") as stream:
+        engine = "scipy" if stream.read(3) == b"CDF" else "h5netcdf"  # the classic format
+    with xr.open_dataset(path, engine=engine) as data:
         table = {}
         for name in [*data.coords, *data.data_vars]:
-            unit = data[name].attrs.get("units", "")
+            values, unit = data[name].values, str(data[name].attrs.get("units", ""))
+            if np.ndim(values) != 1 or values.dtype.kind not in "fiubmM":
+                continue
+            if values.dtype.kind in "mM":  # decoded by its unit: an instant, or a span
+                values, unit = (
+                    (values - (values[0] if values.dtype.kind == "M" else np.timedelta64(0, "s"))) / np.timedelta64(1, "s"),
+                    "s",
+                )
+            unit = SPELLED.get(unit.strip().lower(), unit.replace("\u00b5", "u").replace("\u03bc", "u"))
             key = name if _parse(name)[0] and _parse(name)[1] else f"{name}_{unit}".replace("/", "_per_").rstrip("_")
-            table[key] = np.asarray(data[name].values, float)
+            table[key] = np.asarray(values, float)
         return table, {k: v for k, v in data.attrs.items()}
 
 
@@ -165,7 +203,8 @@ def _read_mat(path):
 
     if h5py.is_hdf5(path):  # v7.3
         with h5py.File(path) as file:
-            content = {k: np.asarray(v).ravel() for k, v in file.items() if hasattr(v, "shape")}
+            content = {k: v[()] for k, v in file.items() if hasattr(v, "shape") and v.dtype.kind in "fiub"}
+            content = {k: np.ravel(v) for k, v in content.items() if max(np.shape(v), default=0) == np.size(v)}
     else:
         from scipy.io import loadmat
         from scipy.io.matlab import MatReadError
@@ -174,7 +213,13 @@ def _read_mat(path):
             content = loadmat(path, squeeze_me=True)
         except (MatReadError, IndexError) as error:
             raise RecordingError(f"{path}: not a MATLAB file ({error}); save it again, or export it as CSV") from None
-    table = {k: np.asarray(v, float).ravel() for k, v in content.items() if not k.startswith("__") and np.ndim(v) == 1}
+    kept = {k: np.asarray(v) for k, v in content.items() if not k.startswith("__") and np.ndim(v) == 1 and np.size(v)}
+    table = {k: v.astype(float) for k, v in kept.items() if v.dtype.kind in "fiub"}
+    if not table:
+        held = ", ".join(k for k in content if not k.startswith("__")) or "nothing"
+        raise RecordingError(
+            f"{path}: holds no vector of numbers ({held}); save time, drive and reading as vectors, not in a struct"
+        )
     return table, {}
 
 
@@ -187,6 +232,7 @@ def _read_log(path):
 
 def _parse(name):
     """(quantity, unit) of a column name such as displacement_um; (None, None) where it is none."""
+    name = name.replace("\u00b5", "u").replace("\u03bc", "u")
     for quantity, units in UNITS.items():
         match = re.fullmatch(rf"{quantity}(?:_(.+))?", name)
         if match:
@@ -199,6 +245,9 @@ def _parse(name):
 def _recordings(path, table, origin, bench) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
     columns, units, available = {}, {}, list(table)
+    if len({len(v) for v in table.values()}) > 1:
+        lengths = ", ".join(f"{k} {len(v)}" for k, v in table.items())
+        raise RecordingError(f"{path}: columns of unequal length ({lengths}); save as many samples of each")
     for quantity in (
         "time",
         "voltage",
@@ -247,7 +296,12 @@ def _column(table, quantity, column):
     """(name, unit) of a quantity's column, as mapped by the bench or by its name; (None, None) where there is none."""
     if "name" in column:
         return (column["name"], column.get("unit")) if column["name"] in table else (None, None)
-    return next(((n, _parse(n)[1]) for n in table if _parse(n)[0] == quantity), (None, None))
+    found = [n for n in table if _parse(n)[0] == quantity]
+    if len(found) > 1:
+        raise RecordingError(
+            f"columns {' and '.join(found)} both hold the {quantity}; say which in [columns.{quantity}] of the bench (name = ...)"
+        )
+    return (found[0], column.get("unit", _parse(found[0])[1])) if found else (None, None)
 
 
 def _find(path, table, quantity, column, required):
@@ -286,6 +340,9 @@ def _one(name, columns, units, origin, bench) -> Recording:
         metadata["frequency_Hz"] = 1.0
         origin = {**origin, "quasistatic": True}
     else:
+        if not np.isfinite(columns["time"]).all():
+            sample = int(np.argmax(~np.isfinite(columns["time"])))
+            raise RecordingError(f"{name}: the time of sample {sample} is no number; remove that row, or write its time")
         time = columns["time"] - columns["time"][0]
     channels = {q: v for q, v in columns.items() if q != "time"}
     if not quasistatic:

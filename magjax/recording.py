@@ -85,7 +85,7 @@ class Recording:
     def _header_frequency(self) -> float | None:
         stated = self.origin.get("metadata", {}).get("frequency_Hz")
         try:
-            return float(stated) if float(stated) > 0 else None
+            return float(stated) if 0 < float(stated) < np.inf else None
         except (TypeError, ValueError):
             return None
 
@@ -149,6 +149,18 @@ class Recording:
         return not self.noise.get(channel) and self.periods() < 2 - 1e-6
 
 
+NO_ANSWER = "the {channel} does not follow the {drive}: its periods share no more than noise does; check the wiring and the column"
+
+
+def follows_nothing(recording: Recording, channel: str) -> bool:
+    """Whether the periods of a channel share no more than independent noise would; False with less than two periods."""
+    blocks = recording.repeats(channel)
+    if len(blocks) < 2:
+        return False
+    shared, noise = float(np.var(blocks.mean(axis=0))), float(np.mean(np.var(blocks, axis=0, ddof=1)))
+    return shared < (1 + 6 * np.sqrt(2 / blocks.shape[1])) * noise / len(blocks)
+
+
 def refuse_constant(name: str, channel: str, values: np.ndarray):
     """Raise `RecordingError` where a channel, (time,), never changes."""
     if np.ptp(values) == 0:
@@ -177,7 +189,7 @@ def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
     power = float(x @ x)
     left = _leftover(x, dt, refined)(refined) + 1e-12 * power
     if found is None:
-        return refined if left < 0.5 * power else None
+        return refined if left < 0.5 * power and (n * dt * refined < 2 or _returns(x, 1 / (refined * dt))) else None
     left_else = _leftover(x, dt, found)(found) + 1e-12 * power
     # a longer period must show in the signal, as a modulation does; a shorter one must leave no more of it
     agrees = abs(refined - found) * n * dt < 0.5
@@ -209,6 +221,14 @@ def _repetition(x, dt):
                 found = _refine(x, dt, 1.0 / (lag * dt), 1.0 / (lag**2 * dt))
                 return found if 2 * lag < n or not _closes(x) else _better(x, dt, 1.0 / (n * dt), found)
     return 1.0 / (n * dt) if _closes(x) else None
+
+
+def _returns(x, per) -> bool:
+    """Whether a signal of zero mean looks like itself a period of `per` samples later."""
+    n = len(x)
+    later = np.interp(np.arange(n - int(per) - 1) + per, np.arange(n), x)
+    now = x[: len(later)]
+    return bool(now @ later > 0.5 * np.sqrt((now @ now) * (later @ later)))
 
 
 def _closes(x) -> bool:

@@ -1,6 +1,7 @@
 """From a result folder to report.html: one file, offline, without script. JSON and report.npz are all that it reads."""
 
 import json
+import zipfile
 from pathlib import Path
 
 from magjax.errors import ConfigurationError
@@ -25,6 +26,32 @@ def rebuild(folder: Path, progress=None) -> Path:
     else:
         raise ConfigurationError(f"{folder}: holds no fit.json or diagnosis.json; give a folder that magjax fit or diagnose wrote")
     say = (lambda text: None) if progress is None else (lambda text: progress(f"report: {text}"))
+    try:
+        return _page_of(folder, name, content, say)
+    except (KeyError, TypeError, AttributeError, ValueError, EOFError, zipfile.BadZipFile, OSError) as error:
+        if stored := _stored_whole(folder, content):
+            raise ConfigurationError(
+                f"{folder}: {stored}; run magjax {'diagnose' if name == 'diagnosis' else 'fit'} again"
+            ) from error
+        raise
+
+
+def _stored_whole(folder, content) -> str | None:
+    """What is wrong with a result folder, in words; None where nothing is."""
+    needed = "base" if isinstance(content, dict) and "verdict" in content else "chi2_per_sample"
+    if not isinstance(content, dict) or needed not in content:
+        return f"its JSON is no result (no {needed})"
+    try:
+        store.load(folder)
+    except Exception as error:
+        return f"report.npz cannot be read ({type(error).__name__})"
+    for name, wrong in (("report.html", Path.is_dir), ("figures", Path.is_file)):
+        if wrong(folder / name):
+            return f"{name} stands in the way"
+    return None
+
+
+def _page_of(folder, name, content, say) -> Path:
     evidence = store.load(folder)
     if name == "diagnosis":
         from .diagnosis_page import diagnosis_page as make

@@ -54,7 +54,7 @@ def main(arguments=None) -> int:
         print(f'magjax: no command "{arguments[0]}"{hint}', file=sys.stderr)
         return 2
     from magjax.errors import MagjaxError
-    from magjax.interrupts import watched
+    from magjax.interrupts import seen, watched
 
     from .waiting import Waiting
 
@@ -71,6 +71,11 @@ def main(arguments=None) -> int:
         return 130
     except BrokenPipeError:
         return 0
+    except Exception:
+        if not seen():
+            raise
+        print(f"magjax {arguments[0]}: interrupted", file=sys.stderr)  # inside an import that made another error of it
+        return 130
     finally:
         if used := sys.modules.get("magjax.cli.runtime"):
             used.discard_empty()

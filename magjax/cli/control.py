@@ -3,7 +3,7 @@
 import json
 import sys
 
-from .runtime import Progress, output_folder, parser
+from .runtime import Progress, output_folder, parser, refuse_overwriting
 
 USAGE = """usage: magjax control {design,bounds,simulate,compare} [OPTIONS]
 
@@ -43,6 +43,7 @@ def run_invert(arguments) -> int:
     options = p.parse_args(arguments)
     from magjax.inverse.command import invert_file
 
+    refuse_overwriting(options.out, options.trajectory)
     summary = invert_file(options.trajectory, options.bench, options.model, options.out, options.of_reading)
     print(json.dumps(summary) if options.json else summary["message"])
     return 0

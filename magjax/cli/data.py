@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from .runtime import output_folder, parser
+from .runtime import output_folder, parser, refuse_overwriting
 
 
 def run(command: str, arguments: list[str]) -> int:
@@ -49,6 +49,7 @@ def run_convert(arguments, command) -> int:
 
     target = Path(options.out)
     output_folder(target.parent)
+    refuse_overwriting(target, options.recording)
     written = []
     if Path(options.recording).suffix.lower() == ".mjlog" and Path(options.recording).is_file():  # with command and provenance
         from magjax.acquire.export import export_log

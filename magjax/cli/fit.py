@@ -6,8 +6,10 @@ from pathlib import Path
 
 from magjax.errors import ConfigurationError, MagjaxError
 
-from .runtime import Progress, output_folder, parser, prepare_jax, told
+from .runtime import Progress, as_json, output_folder, parser, positive, prepare_jax, told
 from .scale import add_intervals, add_where, check_intervals, check_placebo, intervals, placebo_text, run_fleet, with_placebo
+
+MOST_CELLS = 120  # a mass a cell: 7260 of them, and a normal matrix of 420 MB
 
 
 def run(command: str, arguments: list[str]) -> int:
@@ -24,7 +26,7 @@ def _reproduce(command, arguments):
 def _bench_and_start(options):
     from magjax.bench import load_bench
 
-    if options.model:
+    if options.model is not None:
         from magjax.model_file import load_model
 
         actuator, bench = load_model(options.model)
@@ -43,7 +45,7 @@ def _common(command, text, example, recordings="+"):
     )
     p.add_argument("--check", nargs="+", action="extend", default=[], help="recordings to predict that take no part in the fit")
     p.add_argument("--out", help="folder for the results and the report")
-    p.add_argument("--max-jacobians", type=int, default=30, help="limit of the iteration (default 30)")
+    p.add_argument("--max-jacobians", type=positive, default=30, help="limit of the iteration (default 30)")
     return p
 
 
@@ -68,8 +70,8 @@ def run_fit(arguments) -> int:
     from fitting.setup import Choices, effect_parameters
 
     choices = Choices(max_jacobians=options.max_jacobians)
-    if options.cells is not None and options.cells < 2:
-        p.error(f"--cells {options.cells}: the plane needs at least 2 cells along each threshold, say 25")
+    if options.cells is not None and not 2 <= options.cells <= MOST_CELLS:
+        p.error(f"--cells {options.cells}: the plane takes 2 to {MOST_CELLS} cells along each threshold, say 25")
     if options.cells:
         choices = Choices(level=options.cells, knots=None, max_jacobians=options.max_jacobians)
     if options.fleet:
@@ -99,7 +101,7 @@ def run_fit(arguments) -> int:
 
             write_fit(folder, result, recordings, content, _reproduce("fit", arguments), progress)
     if options.json:
-        print(json.dumps(content))
+        print(as_json(content))
     else:
         print(result)
         if table:
@@ -169,7 +171,7 @@ def run_diagnose(arguments) -> int:
         with Progress(options.quiet) as progress:
             write_diagnosis(folder, found, recordings, content, _reproduce("diagnose", arguments), checks, progress)
     if options.json:
-        print(json.dumps(content))
+        print(as_json(content))
     else:
         print(found)
         for row in found.candidates[:8]:
@@ -197,7 +199,7 @@ def _diagnose_strain(options, bench, folder) -> int:
             write_atomically(folder / "diagnosis.json", json.dumps(content, indent=1))
             draw_strain(curves, law, tried["square", None], folder / "strain.png")
     if options.json:
-        print(json.dumps(content))
+        print(as_json(content))
     else:
         print(f"{content['verdict']}: {content['message']}")
         for row in content["laws"][:8]:
@@ -230,13 +232,13 @@ def run_demo(arguments) -> int:
 
         with Progress(options.quiet):
             content = run_paper(folder, options.seed)
-        print(json.dumps(content) if options.json else f"{content['message']}\n\nresults in {folder} (paper.html, paper.json)")
+        print(as_json(content) if options.json else f"{content['message']}\n\nresults in {folder} (paper.html, paper.json)")
         return 0
     from fitting.demo import run_demo as demo
 
     with Progress(options.quiet) as progress:
         text, content = demo(folder, options.seed, progress)
-    print(json.dumps(content) if options.json else text)
+    print(as_json(content) if options.json else text)
     return 0
 
 

@@ -1,6 +1,8 @@
 """What commands share: JAX set up once, common options, progress, output folders that are checked before the work."""
 
 import argparse
+import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -31,6 +33,13 @@ class Parser(argparse.ArgumentParser):
         """One line that names the command and the mend."""
         print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
         raise SystemExit(2)
+
+
+def positive(text: str) -> int:
+    """A whole number above zero, for an option's `type`."""
+    if int(text) < 1:
+        raise ValueError
+    return int(text)
 
 
 def parser(command: str, text: str, example: str) -> Parser:
@@ -75,6 +84,26 @@ def output_folder(path) -> Path | None:
     except OSError as error:
         raise ConfigurationError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
     return folder
+
+
+def as_json(content) -> str:
+    """JSON that any parser takes: null for what is not a finite number."""
+
+    def plain(value):
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(content), allow_nan=False)
+
+
+def refuse_overwriting(out, *inputs) -> None:
+    """Raise `ConfigurationError` where `out` is one of the files that are read."""
+    for file in filter(None, inputs):
+        if Path(out).exists() and Path(file).exists() and Path(out).samefile(file):
+            raise ConfigurationError(f"--out {out}: is the file that is read; give another name")
 
 
 def told(bench):

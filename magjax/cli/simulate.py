@@ -1,11 +1,10 @@
 """Commands simulate and sweep."""
 
 import dataclasses
-import json
 
 from magjax.errors import ConfigurationError
 
-from .runtime import Progress, output_folder, parser, prepare_jax, told
+from .runtime import Progress, as_json, output_folder, parser, prepare_jax, refuse_overwriting, told
 from .scale import add_where, executor_of
 
 
@@ -15,7 +14,7 @@ def run(command: str, arguments: list[str]) -> int:
 
 
 def _actuator(options):
-    if options.model:
+    if options.model is not None:
         from magjax.model_file import load_model
 
         return load_model(options.model)
@@ -81,6 +80,7 @@ def run_simulate(arguments) -> int:
     from magjax.writers import write_dataset
 
     if options.drive:
+        refuse_overwriting(path, options.drive)
         drive, dt, periodic = _drive_of(options.drive, bench)
     else:
         if options.samples < 20 or not options.frequency > 0:
@@ -96,7 +96,7 @@ def run_simulate(arguments) -> int:
     text = f"peak to peak {stroke:.4g}; wrote {path}"
     if not settled:
         text += f"; not settled: the last two of {MOST_PERIODS} periods still differ by {float(signals.unsettled):.1e} of the peak to peak"
-    print(json.dumps({"file": str(path), "peak_to_peak": stroke, "settled": settled}) if options.json else text)
+    print(as_json({"file": str(path), "peak_to_peak": stroke, "settled": settled}) if options.json else text)
     return 0 if settled else 4
 
 
@@ -140,5 +140,5 @@ def run_sweep(arguments) -> int:
     text = f"{count} steady states; wrote {path}"
     if left:
         text += f"; {left} not settled after {MOST_PERIODS} periods: see the variable unsettled"
-    print(json.dumps({"file": str(path), "points": count, "unsettled": left}) if options.json else text)
+    print(as_json({"file": str(path), "points": count, "unsettled": left}) if options.json else text)
     return 4 if left else 0

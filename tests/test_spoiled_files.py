@@ -1,0 +1,157 @@
+"""Files as users have them: each is read as it is meant, or refused in one line that says what to mend."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magjax
+from fitting.floors import swapped
+from fitting.setup import spectra_of
+from magjax.bench import load_bench
+from magjax.errors import ConfigurationError, RecordingError
+from magjax.inspection import inspect
+from magjax.model_file import load_model
+from magjax.readers import load_recordings
+from magjax.recording import follows_nothing
+
+N, PERIODS, F = 200, 4, 50.0
+PHASE = 2 * np.pi * np.arange(N * PERIODS) / N
+TIME = np.arange(N * PERIODS) / (N * F)
+CURRENT = 0.8 * np.sin(PHASE)
+NOISE = np.random.default_rng(3).standard_normal(N * PERIODS)
+READING = 3e-5 + 1e-5 * np.sin(PHASE - 0.6) + 3e-8 * NOISE
+
+
+def rows(separator=",", comma=".", head="time_s,current_A,displacement_m", columns=(TIME, CURRENT, READING)):
+    lines = [separator.join(f"{v:.9g}".replace(".", comma) for v in row) for row in zip(*columns, strict=True)]
+    return "\n".join([head.replace(",", separator), *lines]) + "\n"
+
+
+def read(tmp_path, text, name="rec.csv", bench="aa-050h"):
+    path = tmp_path / name
+    path.write_bytes(text.encode("utf-8") if isinstance(text, str) else text)
+    return load_recordings([path], bench)[0]
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas_are_read(tmp_path, separator):
+    found = read(tmp_path, rows(separator, ","))
+    assert np.abs(found.channels["displacement"] - READING).max() < 1e-13 and found.frequency() == pytest.approx(F)
+
+
+@pytest.mark.parametrize(("text", "why"), [
+    (rows(head="time_s,current_A,displacement_m\ns,A,m"), 'line 2 holds "s", which is no number'),
+    (rows().replace("\n", "\n# so\n", 1).replace("0.005,", "0+1j,"), "which is no number"),
+    (rows(head="time_s,current_A,current_A"), "two columns are named current_A"),
+    (rows(head="time_s,current_A,displacement_m,displacement_um", columns=(TIME, CURRENT, READING, 1e6 * READING)), "both hold the displacement"),
+    (rows(columns=(np.where(np.arange(len(TIME)) == 7, np.nan, TIME), CURRENT, READING)), "the time of sample 7 is no number"),
+    (rows(columns=(TIME, CURRENT, np.where(np.arange(len(TIME)) == 9, 1e3, READING))), "only sample 9 does: a spike"),
+    (rows().encode("utf-16"), "no text in UTF-8"),
+])  # fmt: skip
+def test_what_cannot_be_meant_is_refused(tmp_path, text, why):
+    with pytest.raises(RecordingError, match=why) as caught:
+        read(tmp_path, text)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_unit_without_a_name_holds_for_the_column_that_is_found(tmp_path):
+    bench = tmp_path / "b.toml"
+    bench.write_text(
+        Path(magjax.__file__).with_name("benches").joinpath("aa-050h.toml").read_text() + '\n[columns.displacement]\nunit = "um"\n'
+    )
+    found = read(tmp_path, rows(columns=(TIME, CURRENT, 1e6 * READING)), bench=bench)
+    assert np.abs(found.channels["displacement"] - READING).max() < 1e-13
+
+
+@pytest.mark.parametrize("how", ["instants", "spans", "words", "classic"])
+def test_netcdf_as_others_write_it(tmp_path, how):
+    import xarray as xr
+
+    time = {"instants": np.datetime64("2026-01-02T03:04:05", "ns") + (TIME * 1e9).astype("timedelta64[ns]"),
+            "spans": (TIME * 1e9).astype("timedelta64[ns]")}.get(how, TIME)  # fmt: skip
+    data = xr.Dataset({"current": ("time", CURRENT, {"units": "ampere"}), "displacement": ("time", 1e6 * READING, {"units": "\u00b5m"}),
+                       "operator": "A. B.", "temperature": 21.0}, {"time": time})  # fmt: skip
+    if how == "classic":
+        data = data.drop_vars("operator")
+    data.to_netcdf(
+        tmp_path / "r.nc",
+        engine="scipy" if how == "classic" else "h5netcdf",
+        format="NETCDF3_CLASSIC" if how == "classic" else None,
+    )
+    found = load_recordings([tmp_path / "r.nc"], "aa-050h")[0]
+    assert found.frequency() == pytest.approx(F, rel=1e-6) and np.abs(found.channels["displacement"] - READING).max() < 1e-12
+
+
+def test_matlab_files_with_more_in_them(tmp_path):
+    from scipy.io import savemat
+
+    good = {"time_s": TIME, "current_A": CURRENT, "displacement_m": READING}
+    savemat(tmp_path / "more.mat", {**good, "who": "A. B.", "run": {"x": 1}})
+    assert load_recordings([tmp_path / "more.mat"], "aa-050h")[0].n_samples == len(TIME)
+    savemat(tmp_path / "short.mat", {**good, "current_A": CURRENT[:-3]})
+    savemat(tmp_path / "struct.mat", {"data": good})
+    for name, why in (("short", "unequal length"), ("struct", "no vector of numbers")):
+        with pytest.raises(RecordingError, match=why):
+            load_recordings([tmp_path / f"{name}.mat"], "aa-050h")
+
+
+def test_a_reading_that_follows_nothing_is_refused(tmp_path):
+    bench = load_bench("aa-050h")
+    good, lost = (read(tmp_path, rows(columns=(TIME, CURRENT, y))) for y in (READING, 3e-5 + 1e-5 * NOISE))
+    weak = read(tmp_path, rows(columns=(TIME, CURRENT, 3e-5 + 1e-6 * (np.sin(PHASE) + NOISE))))  # buried, but there
+    assert follows_nothing(lost, "displacement") and not any(follows_nothing(r, "displacement") for r in (good, weak))
+    assert "does not follow the current" in inspect(lost, bench).problems[0] and not inspect(good, bench).problems
+    with pytest.raises(RecordingError, match="does not follow the current"):
+        spectra_of([good, lost], bench)
+
+
+def test_a_sign_that_is_swapped_in_one_recording_is_found(tmp_path):
+    bench, runs = load_bench("aa-050h"), []
+    for f, lag, sign in ((20, 0.2, 1), (100, 1.0, -1), (300, 2.2, 1)):
+        y = 3e-5 + 1e-5 * np.sin(PHASE - lag) + 3e-8 * NOISE
+        runs.append(read(tmp_path, rows(columns=(TIME * F / f, sign * CURRENT, y)), f"r{f}.csv"))
+    spectra = spectra_of(runs, bench)
+    assert "r100.csv moves against" in swapped(spectra) and swapped(spectra, each=False) is None
+    assert swapped([spectra[0], spectra[2]]) is None and "at the lowest frequency" in swapped([s for s in spectra_of([
+        read(tmp_path, rows(columns=(TIME, -CURRENT, READING)))], bench)])  # fmt: skip
+
+
+def test_a_header_that_contradicts_by_a_thousand_tells_the_unit_of_the_time(tmp_path):
+    card = inspect(read(tmp_path, f"# frequency_Hz: {F}\n" + rows(columns=(1e3 * TIME, CURRENT, READING))), load_bench("aa-050h"))
+    assert any("name the column time_ms" in w for w in card.warnings)
+    for odd in ("# frequency_Hz: inf\n", "# bridged_samples: nan\n"):
+        assert not inspect(read(tmp_path, odd + rows()), load_bench("aa-050h")).problems
+    jittered = TIME + 0.1 / (N * F) * NOISE.clip(-1, 1)
+    assert any(
+        "jitters" in w for w in inspect(read(tmp_path, rows(columns=(jittered, CURRENT, READING))), load_bench("aa-050h")).warnings
+    )
+
+
+@pytest.mark.parametrize(("change", "why"), [
+    (lambda m: m["parameters"].update({"coil.R_eddy": float("nan")}), "coil.R_eddy is not a finite number"),
+    (lambda m: m["parameters"].update({"coil.R_eddy": -5.0}), "coil.R_eddy = -5 is outside"),
+    (lambda m: m["parameters"].pop("mechanics.f0"), "lacks mechanics.f0"),
+])  # fmt: skip
+def test_a_model_that_was_spoiled_is_refused(tmp_path, change, why):
+    from fitting.result import write_model
+
+    bench = load_bench("aa-050h")
+    write_model(tmp_path, bench.actuator(), bench)
+    load_model(tmp_path)
+    content = json.loads((tmp_path / "model.json").read_text())
+    change(content)
+    (tmp_path / "model.json").write_text(json.dumps(content))
+    with pytest.raises(ConfigurationError, match=why):
+        load_model(tmp_path)
+
+
+def test_an_output_never_replaces_what_is_read(tmp_path):
+    path = tmp_path / "rec.csv"
+    path.write_text(rows())
+    for command in (["export", path, "--out", path], ["simulate", "--drive", path, "--out", path], ["invert", path, "--out", path]):
+        ended = subprocess.run([sys.executable, "-m", "magjax", *map(str, command)], capture_output=True, text=True)
+        assert ended.returncode == 2 and "is the file that is read" in ended.stderr and path.read_text() == rows(), command
