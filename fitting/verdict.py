@@ -185,7 +185,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     alone = dominant(evidence)
     full = min(full, DOMINANT[0]) if alone else full
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
-        return _unknown(evidence, common)
+        first = first_alone(evidence)
+        return verdict(first) if first is not None else _unknown(evidence, common)
     if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
@@ -223,6 +224,17 @@ def dominant(evidence) -> bool:
     ]
     noise = NULL_CHI2 * current.data_count
     return bool(left) and min(left) - noise > DOMINANT[1] * (chi2_of(current) - noise)
+
+
+def first_alone(evidence) -> Evidence | None:
+    """The evidence with the first of several effects alone, where it is `dominant`: those after it do not meet the noise, and
+    make up for the form of its law. None elsewhere."""
+    steps = evidence.reached.steps
+    if len(steps) < 2:
+        return None
+    reached = dataclasses.replace(evidence.reached, current=steps[0][0].result, steps=steps[:1], form=None)
+    first = dataclasses.replace(evidence, reached=reached)
+    return first if dominant(first) and first.share >= DOMINANT[0] and first.excess < FAR_FROM_NOISE else None
 
 
 def unconfirmed(reached):

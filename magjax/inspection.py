@@ -10,6 +10,7 @@ from .plausibility import STRONG_FIELD
 from .recording import NO_ANSWER, follows_nothing
 from .terms import DRIVE_UNITS
 
+LITTLE = 1e-4  # of the relays of the plane: a hundredth of its width
 MOST_FILLED = 0.05  # of the samples: more is no measurement
 
 
@@ -96,6 +97,8 @@ def inspect(recording, bench) -> Card:
     if whole is not None:
         share = min((H.max() - H.min()) / (whole[1] - whole[0]), 1.0) ** 2
         facts["visited plane"] += f", {share:.0%} of the relays that the bench's limits reach"
+        if share < LITTLE:
+            warnings.append(f"the drive is hardly felt: check unit and scale of [columns.{bench.drive}], which multiply")
     limit, peak, unit = bench.limit, float(np.abs(x).max()), DRIVE_UNITS[bench.drive]
     if limit and peak > 1.02 * limit:
         warnings.append(

@@ -195,7 +195,7 @@ def _refuse_outside(actuator, lowest, highest, where=""):
         terms = actuator.terms
         raise ConfigurationError(
             f"the drive{where} leads the {terms.field} to {lowest:.5g}..{highest:.5g} {terms.unit}, outside the Preisach plane "
-            f"{low:.5g}..{high:.5g} {terms.unit}; lower the drive or widen the plane (limits in the bench file)"
+            f"{low:.5g}..{high:.5g} {terms.unit}; lower the drive; a fitted plane reaches as far as the recordings, that of a bench file as its limits"
         )
 
 

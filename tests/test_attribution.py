@@ -13,7 +13,7 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
-from fitting.verdict import dominant, too_little, unconfirmed
+from fitting.verdict import Evidence, dominant, first_alone, too_little, unconfirmed
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -96,7 +96,14 @@ def test_an_effect_that_leaves_far_less_than_all_others_is_named_whatever_its_fo
     steps = [(best, [best], [best, other], plain)]
     evidence = SimpleNamespace(reached=Reached(best.result, steps, fitted), plain=plain)
     assert dominant(evidence) is named
-    assert not dominant(SimpleNamespace(reached=Reached(best.result, 2 * steps, fitted), plain=plain))
+    # with a second effect that does not meet the noise either, the first is named alone
+    second = (trial("amplifier_clipping", 3.0, base=3.4),) + ((), (), best.result)
+    two = Evidence(Reached(second[0].result, [*steps, second], fitted), (), plain, plain, (), (), None, ((), ()), {}, {}, ())
+    assert not dominant(two)
+    first = first_alone(two)
+    assert (first is not None) is named and first_alone(dataclasses.replace(two, reached=evidence.reached)) is None
+    if named:
+        assert [t.name for t, *_ in first.reached.steps] == ["coulomb_friction"] and first.excess == 3.4
 
 
 def test_rivals_where_the_best_is_not_the_whole_truth():

@@ -71,7 +71,7 @@ def run_fit(arguments) -> int:
 
     choices = Choices(max_jacobians=options.max_jacobians)
     if options.cells is not None and not 2 <= options.cells <= MOST_CELLS:
-        p.error(f"--cells {options.cells}: the plane takes 2 to {MOST_CELLS} cells along each threshold, say 25")
+        p.error(f"--cells {options.cells}: the plane needs at least 2 cells along each threshold and takes {MOST_CELLS}, say 25")
     if options.cells:
         choices = Choices(level=options.cells, knots=None, max_jacobians=options.max_jacobians)
     if options.fleet:

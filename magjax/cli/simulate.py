@@ -30,6 +30,8 @@ def _target(path):
     path = Path(path)
     if path.is_dir():
         raise ConfigurationError(f"{path}: is a folder; give a file in it, as in --out {path / 'simulation.nc'}")
+    if path.suffix.lower() != ".nc":
+        raise ConfigurationError(f"--out {path}: every signal is written, as NetCDF; name it {path.with_suffix('.nc')}")
     output_folder(path.parent)
     return path
 
