@@ -98,9 +98,10 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     """The diagnosis; where the fit meets its noise and misses a check recording by far, that one joins the recordings, if
     others are left to check: what it shows they may not reach. What is named with it must foretell the others no worse.
     """
-    final = found.repaired or found.base
     known = found.verdict in ("attributed", "group", "nothing_missing") and not any(r.get("joined") for r in found.check)
-    if not known or not final.chi2_per_sample < MISFIT or len(found.check) != len(check):
+    if not known or not check or len(found.check) != len(check):
+        return found
+    if not (found.repaired or found.base).chi2_per_sample < MISFIT:
         return found
     ratios = [r["rms_after"] / r["noise_rms"] if r["noise_rms"] and not r["beyond_plane"] > BEYOND else 0.0 for r in found.check]
     if not max(ratios, default=0.0) > MISSED:
