@@ -245,9 +245,6 @@ def _parse(name):
 def _recordings(path, table, origin, bench) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
     columns, units, available = {}, {}, list(table)
-    if len({len(v) for v in table.values()}) > 1:
-        lengths = ", ".join(f"{k} {len(v)}" for k, v in table.items())
-        raise RecordingError(f"{path}: columns of unequal length ({lengths}); save as many samples of each")
     for quantity in (
         "time",
         "voltage",
@@ -264,6 +261,9 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         found = _find(path, table, quantity, column, required=quantity in (bench.drive, bench.output))
         if found is not None:
             columns[quantity], units[quantity] = found, _column(table, quantity, column)[1]
+    if len({len(v) for v in columns.values()}) > 1:
+        lengths = ", ".join(f"{q} {len(v)}" for q, v in columns.items())
+        raise RecordingError(f"{path}: columns of unequal length ({lengths}); save as many samples of each")
     if not bench.columns.get("time", {}).get("quasistatic") and "time" not in columns:
         raise RecordingError(f"{path}: no time column among {', '.join(available)}; name one time_s or map it in [columns.time]")
     if split is not None:
@@ -272,7 +272,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         labels = list(dict.fromkeys(table[split]))
         parts = [(f"{path.name}[{split}={label:g}]", table[split] == label) for label in labels]
     else:
-        parts = [(path.name, np.ones(len(next(iter(table.values()))), bool))]
+        parts = [(path.name, np.ones(len(columns[bench.drive]), bool))]
     if not bench.columns.get("time", {}).get("quasistatic"):
         for name, rows in parts:
             _refuse_clipping(name, {q: v[rows] for q, v in columns.items()}, bench)

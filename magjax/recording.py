@@ -157,6 +157,7 @@ def follows_nothing(recording: Recording, channel: str) -> bool:
     blocks = recording.repeats(channel)
     if len(blocks) < 2:
         return False
+    blocks = blocks - blocks.mean(axis=1, keepdims=True)  # a drift is another matter
     shared, noise = float(np.var(blocks.mean(axis=0))), float(np.mean(np.var(blocks, axis=0, ddof=1)))
     return shared < (1 + 6 * np.sqrt(2 / blocks.shape[1])) * noise / len(blocks)
 

@@ -90,7 +90,7 @@ def test_matlab_files_with_more_in_them(tmp_path):
     from scipy.io import savemat
 
     good = {"time_s": TIME, "current_A": CURRENT, "displacement_m": READING}
-    savemat(tmp_path / "more.mat", {**good, "who": "A. B.", "run": {"x": 1}})
+    savemat(tmp_path / "more.mat", {"gains": np.arange(3.0), **good, "who": "A. B.", "run": {"x": 1}})
     assert load_recordings([tmp_path / "more.mat"], "aa-050h")[0].n_samples == len(TIME)
     savemat(tmp_path / "short.mat", {**good, "current_A": CURRENT[:-3]})
     savemat(tmp_path / "struct.mat", {"data": good})
