@@ -17,6 +17,7 @@ from magjax.inspection import inspect
 from magjax.model_file import load_model
 from magjax.readers import load_recordings
 from magjax.recording import follows_nothing
+from magjax.writers import write_recording
 
 N, PERIODS, F = 200, 4, 50.0
 PHASE = 2 * np.pi * np.arange(N * PERIODS) / N
@@ -150,8 +151,17 @@ def test_a_model_that_was_spoiled_is_refused(tmp_path, change, why):
 
 
 def test_an_output_never_replaces_what_is_read(tmp_path):
-    path = tmp_path / "rec.csv"
+    path, binary = tmp_path / "rec.csv", tmp_path / "rec.nc"
     path.write_text(rows())
-    for command in (["export", path, "--out", path], ["simulate", "--drive", path, "--out", path], ["invert", path, "--out", path]):
+    write_recording(binary, load_recordings([path], "aa-050h")[0])
+    before = binary.read_bytes()
+
+    def refused(*command):
         ended = subprocess.run([sys.executable, "-m", "magjax", *map(str, command)], capture_output=True, text=True)
-        assert ended.returncode == 2 and "is the file that is read" in ended.stderr and path.read_text() == rows(), command
+        return ended.stderr if ended.returncode == 2 else ""
+
+    assert "is the file that is read" in refused("export", path, "--out", path)
+    assert "is the file that is read" in refused("invert", path, "--out", path)
+    assert "is the file that is read" in refused("simulate", "--drive", binary, "--out", binary)
+    assert f"name it {binary}" in refused("simulate", "--drive", binary, "--out", path)
+    assert path.read_text() == rows() and binary.read_bytes() == before
