@@ -129,10 +129,10 @@ def test_the_only_check_recording_never_joins(monkeypatch):
 @pytest.mark.long
 def test_physics_that_only_a_check_recording_reaches_is_found():
     bench, rng = load_bench("aa-050h"), np.random.default_rng(5)
-    truth = concealed_actuator(bench, AmplifierClipping(inverse_limit=0.5, tau_L=1e-3))  # 2 A: asked for at 400 Hz alone
+    truth = concealed_actuator(bench, AmplifierClipping(inverse_limit=0.7, tau_L=1e-3))  # 1.4 A: asked for at 400 Hz alone
     drives = ((10, 0.8, 0.1), (30, 0.5, -0.2), (60, 0.8, 0.1), (100, 0.5, -0.2), (150, 0.7, 0.1))
     runs = [record(truth, *d, rng, f"r{d[0]}") for d in drives]
-    check = [record(truth, *d, rng, f"c{d[0]}") for d in ((80, 0.6, 0.0), (400, 0.85, 0.0), (120, 0.7, 0.05))]
+    check = [record(truth, *d, rng, f"c{d[0]}") for d in ((80, 0.6, 0.0), (400, 0.75, 0.1), (120, 0.7, 0.05))]
     assert diagnose(runs, bench, check=[check[0], check[2]]).verdict == "nothing_missing"
     found = diagnose(runs, bench, check=check)
     assert "amplifier_clipping" in {e["name"] for e in found.effects} | {n for g in found.groups for n in g}, str(found)
