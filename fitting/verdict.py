@@ -69,6 +69,12 @@ class Diagnosis:
         """The same with a further sentence."""
         return dataclasses.replace(self, message=f"{self.message} {note}")
 
+    def parted(self, check) -> tuple[list, list]:
+        """The check recordings that joined those of the fit, after them, and those that are left to check."""
+        rows = list(zip(check, self.check, strict=False))  # a data problem has checked nothing
+        joined = [c for c, row in rows if row.get("joined")]
+        return joined, [c for c, row in rows if not row.get("joined")]
+
     def without_checks(self, refused) -> "Diagnosis":
         """The same with a word on check recordings that could not be used; `refused`: a sentence for each."""
         if not refused:

@@ -87,6 +87,9 @@ def test_a_check_missed_by_far_joins_the_recordings_where_more_is_named_with_it(
     assert asked == [(["fit.csv", "c1.csv"], ["c0.csv", "c2.csv"])]
     assert [e["name"] for e in found.effects] == list(BOTH) and "c1.csv is missed by 13 times its noise" in found.message
     assert [r.get("joined") for r in found.check] == [None, True, None] and found.check[1]["rms_after"] == 4.2e-8
+    joined, left = found.parted(CHECKS)
+    assert [r.name for r in joined] == ["c1.csv"] and [r.name for r in left] == ["c0.csv", "c2.csv"]
+    assert Diagnosis("data_problem", "No.").parted(CHECKS) == ([], [])
     # once: what it leaves to check is not asked for again
     assert with_missed(monkeypatch, found, None)[1] == []
 

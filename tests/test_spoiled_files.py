@@ -4,14 +4,18 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import magjax
+from fitting.fit import outcome
 from fitting.floors import swapped
 from fitting.setup import spectra_of
 from magjax.bench import load_bench
+from magjax.cli import main
+from magjax.cli.runtime import as_json
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.inspection import inspect
 from magjax.model_file import load_model
@@ -165,3 +169,60 @@ def test_an_output_never_replaces_what_is_read(tmp_path):
     assert "is the file that is read" in refused("simulate", "--drive", binary, "--out", binary)
     assert f"name it {binary}" in refused("simulate", "--drive", binary, "--out", path)
     assert path.read_text() == rows() and binary.read_bytes() == before
+
+
+@pytest.mark.parametrize(("name", "content", "why"), [
+    ("fit.json", "{}", "is no result"), ("fit.json", "[]", "is no result"), ("diagnosis.json", '{"verdict": "group"}', "no base"),
+    ("fit.json", '{"chi2_per_sample": 1.0}', "report.npz cannot be read"),
+])  # fmt: skip
+def test_a_result_folder_that_was_spoiled_is_told(tmp_path, name, content, why):
+    from fitting.report import rebuild
+
+    (tmp_path / name).write_text(content)
+    (tmp_path / "report.npz").write_bytes(b"PK\3\4 cut")
+    with pytest.raises(ConfigurationError, match=why):
+        rebuild(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_what_stands_where_the_report_goes_is_told(tmp_path):
+    from fitting.report.page import render
+
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(ConfigurationError, match="move it away"):
+        render(tmp_path / "report.html", {"title": "t", "sections": []}, "")
+
+
+def test_a_fit_that_has_led_nowhere_says_so():
+    rows = [SimpleNamespace(chi2_per_sample=c, file=f"runs/r{c}.csv", frequency=50.0) for c in (3.0, 4e5)]
+    solution = SimpleNamespace(interrupted=False, converged=True, jacobians=9)
+    for chi2n in (2e5, np.nan):
+        told = outcome(chi2n, rows, solution, (), SimpleNamespace(spectra=()))
+        assert told.startswith("the fit has led nowhere") and "r400000.0.csv" in told and "\n" not in told
+    at = (SimpleNamespace(name="mechanics.xi", at_bound=True),)
+    assert "20 times the noise (worst: r400000.0.csv)" in outcome(400.0, rows, solution, at, SimpleNamespace(spectra=()))
+
+
+def test_numbers_that_are_none_are_null_in_json():
+    found = as_json({"a": [np.nan, 1.5, {"b": -np.inf}], "c": (float("nan"),), "d": True, "e": None})
+    assert json.loads(found) == {"a": [None, 1.5, {"b": None}], "c": [None], "d": True, "e": None} and "NaN" not in found
+
+
+@pytest.mark.parametrize(("options", "why"), [
+    (["--cells", "100000"], "takes 120"), (["--max-jacobians", "0"], "max-jacobians"), (["--model", ""], "not a fitted model"),
+])  # fmt: skip
+def test_options_that_cannot_work_are_refused_first(tmp_path, options, why, capsys):
+    path = tmp_path / "rec.csv"
+    path.write_text(rows())
+    bench = [] if "--model" in options else ["--bench", "aa-050h"]
+    try:
+        status = main(["fit", str(path), *bench, *options])
+    except SystemExit as ended:
+        status = ended.code
+    said = capsys.readouterr().err
+    assert status == 2 and why in said and len(said.strip().splitlines()) == 1
+
+
+def test_a_drive_that_is_hardly_felt_is_warned_of(tmp_path):
+    card = inspect(read(tmp_path, rows(columns=(TIME, 1e-3 * CURRENT, READING))), load_bench("aa-050h"))
+    assert any("unit and scale" in w for w in card.warnings) and not card.problems

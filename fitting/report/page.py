@@ -26,33 +26,15 @@ def rebuild(folder: Path, progress=None) -> Path:
     else:
         raise ConfigurationError(f"{folder}: holds no fit.json or diagnosis.json; give a folder that magjax fit or diagnose wrote")
     say = (lambda text: None) if progress is None else (lambda text: progress(f"report: {text}"))
-    try:
-        return _page_of(folder, name, content, say)
-    except (KeyError, TypeError, AttributeError, ValueError, EOFError, zipfile.BadZipFile, OSError) as error:
-        if stored := _stored_whole(folder, content):
-            raise ConfigurationError(
-                f"{folder}: {stored}; run magjax {'diagnose' if name == 'diagnosis' else 'fit'} again"
-            ) from error
-        raise
-
-
-def _stored_whole(folder, content) -> str | None:
-    """What is wrong with a result folder, in words; None where nothing is."""
-    needed = "base" if isinstance(content, dict) and "verdict" in content else "chi2_per_sample"
+    needed, again = ("base", "diagnose") if name == "diagnosis" else ("chi2_per_sample", "fit")
     if not isinstance(content, dict) or needed not in content:
-        return f"its JSON is no result (no {needed})"
+        raise ConfigurationError(f"{path}: is no result (no {needed}); run magjax {again} again")
     try:
-        store.load(folder)
-    except Exception as error:
-        return f"report.npz cannot be read ({type(error).__name__})"
-    for name, wrong in (("report.html", Path.is_dir), ("figures", Path.is_file)):
-        if wrong(folder / name):
-            return f"{name} stands in the way"
-    return None
-
-
-def _page_of(folder, name, content, say) -> Path:
-    evidence = store.load(folder)
+        evidence = store.load(folder)
+    except (EOFError, ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+        raise ConfigurationError(
+            f"{folder}: report.npz cannot be read ({type(error).__name__}); run magjax {again} again"
+        ) from None
     if name == "diagnosis":
         from .diagnosis_page import diagnosis_page as make
     else:
@@ -72,6 +54,9 @@ def render(target: Path, page: dict, reproduce: str, versions: str = "", source:
     """Write one page from its sections, and its figures as files beside it."""
     from jinja2 import Environment
 
+    for there, wrong in ((target, target.is_dir()), (target.parent / "figures", (target.parent / "figures").is_file())):
+        if wrong:
+            raise ConfigurationError(f"{there}: stands where the report goes; move it away")
     pictures = [part["picture"] for s in page["sections"] for part in s["parts"] if part.get("picture")]
     if pictures:
         shapes = target.parent / "figures"

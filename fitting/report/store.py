@@ -47,5 +47,5 @@ def load(folder: Path) -> dict:
     path = Path(folder) / FILE
     if not path.exists():
         return {}
-    with np.load(path, allow_pickle=False) as stored:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:  # numpy alone leaves a spoiled file open
         return fold({key: stored[key] for key in stored.files})

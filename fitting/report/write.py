@@ -51,7 +51,7 @@ def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduc
         found["catalogue"] = json.dumps(catalogue(base.bench.terms))
         if repaired is not None:
             found["repaired"] = evidence.of_fit(repaired, chosen=[int(k) for k in found["base"]["chosen"]])
-        checks = [c for c, row in zip(checks, diagnosis.check, strict=True) if not row.get("joined")]
+        _, checks = diagnosis.parted(checks)
         if checks:
             own_zeros = any(s.zero for s in best.spectra)
             found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench, own_zeros)

@@ -159,7 +159,7 @@ def run_diagnose(arguments) -> int:
                              choices=Choices(max_jacobians=options.max_jacobians), progress=progress).without_checks(refused)  # fmt: skip
             if options.placebo and found.verdict != "data_problem":
                 try:
-                    found = with_placebo(found, recordings, options, progress)
+                    found = with_placebo(found, [*recordings, *found.parted(checks)[0]], options, progress)
                 except (MagjaxError, KeyboardInterrupt) as error:  # the diagnosis itself is done and is kept
                     stopped = error
     except RecordingError as error:
