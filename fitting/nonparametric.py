@@ -15,12 +15,12 @@ import numpy as np
 
 from magjax.chain import Timeline
 from magjax.constants import MU0
-from magjax.effects.base import AbstractEffect
 from magjax.effects.learned_term import PAD, LearnedTerm
-from magjax.simulate import driven_current, finish_chain, run_chain
+from magjax.simulate import run_chain
 
+from .columns import marching, through_march, to_lines, trajectory
 from .model import whitened
-from .screen import Projector, _march_columns, _trajectory
+from .screen import Projector
 
 ONE = 48  # cosines of a function of one variable
 FINE = 160  # where none of these serves: of one variable of the sensor or the strain
@@ -116,42 +116,14 @@ def null_term(block, variables, signals, actuator, counts) -> LearnedTerm:
     return LearnedTerm.null(block, variables, ends[:, 0], ends[:, 1], counts, np.ones(int(np.prod(counts))), size, knee)
 
 
-class _VirtualSignal(AbstractEffect):
-    """Signals added at the boundaries behind the hysteresis, (time,): free displacement, force, reading."""
-
-    added: jax.Array
-    force: jax.Array
-    read: jax.Array
-
-    def strain(self, free_displacement, magnetization, field, line, actuator):
-        return free_displacement + self.added
-
-    def displacement(self, displacement, free_displacement, signals, line, actuator):
-        return displacement + line.filter(self.force, actuator.mechanics.response)
-
-    def reading(self, reading, signals, line, actuator):
-        return reading + self.read
-
-
 @eqx.filter_jit
-def _late_columns(predictor, actuator, states, directions):
-    """Change of the lines by virtual signals behind the hysteresis, to first order, (columns, recordings, harmonics + 1).
+def _moved(predictor, actuator, force):
+    """Displacement by a force behind the hysteresis, given as the static displacement, m, (columns, recordings, samples) per grid."""
 
-    `directions`: per grid, (free displacement, force, reading), (columns, recordings, grid) each."""
+    def one(force, dt):
+        return Timeline(dt, force.shape[0], True).filter(force, actuator.mechanics.response)
 
-    def lines_of(signals):
-        def one(drive, dt, H, M, parts):
-            line = Timeline(dt, drive.shape[0], True)
-            changed = dataclasses.replace(actuator, effects=(*actuator.effects, _VirtualSignal(*parts)))
-            s = finish_chain(changed, line, drive, driven_current(actuator, drive, line), H, M, H, H, jnp.zeros(()))
-            return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / drive.shape[0]
-
-        grids = zip(predictor.drives, predictor.steps, states, signals, strict=True)
-        return jnp.concatenate([jax.vmap(one)(d, t, H, M, p) for d, t, (H, M), p in grids])[np.asarray(predictor.index)]
-
-    origin = jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), directions)
-    _, push = jax.linearize(lines_of, origin)
-    return jax.lax.map(push, directions, batch_size=8)
+    return tuple(jax.vmap(jax.vmap(one), (0, None))(f, dt) for f, dt in zip(force, predictor.steps, strict=True))
 
 
 class Tangents:
@@ -166,7 +138,7 @@ class Tangents:
         self.last = _signals(self.fine, self.actuator)
         self.signals = {n: np.concatenate([np.asarray(g[n]).ravel() for g in self.last]) for n in self.last[0]}
         self.states = [(g["coil_field"], g["magnetization"]) for g in self.last]
-        self.trajectory = _trajectory(self.predictor, self.actuator)
+        self.fields, self.trajectory = trajectory(self.predictor, marching(self.actuator))
         self.marched = [_step_signals(self.actuator.coil.scheme, *(np.asarray(x) for x in part)) for part in self.trajectory]
         self.zero = eqx.tree_at(lambda t: t.lines, self.problem.target, jnp.zeros_like(self.problem.target.lines))
 
@@ -179,19 +151,25 @@ class Tangents:
             at = 2 if term.place == "coil" else 0
             rows = tuple(tuple(w if k == at else z for k in range(3)) for w, z in zip(waves, still, strict=True))
             changes = tuple(np.zeros((len(term.coefficients), *d.shape)) for d in p.drives)
-            lines = _march_columns(p, a, (rows, changes))
+            lines = self._early(rows, changes)
         else:
             waves = tuple(float(term.size) * self._waves(term, g) for g in self.last)
             if term.place == "source":
                 waves = tuple(w[:, :, :: w.shape[2] // d.shape[1]] for w, d in zip(waves, p.drives, strict=True))
                 shapes = [(len(w), *np.shape(part[0])) for w, part in zip(waves, self.trajectory, strict=True)]
-                rows = tuple(tuple(np.zeros(shape) for _ in range(3)) for shape in shapes)
-                lines = _march_columns(p, a, (rows, waves))
+                lines = self._early(tuple(tuple(np.zeros(shape) for _ in range(3)) for shape in shapes), waves)
             else:
                 at = ("magnetostriction", "mechanics", "sensor").index(term.place)
-                given = tuple(tuple(w if k == at else np.zeros_like(w) for k in range(3)) for w in waves)
-                lines = _late_columns(self.fine, a, self.states, given)
+                waves = _moved(self.fine, a, waves) if term.place == "mechanics" else waves
+                given = tuple(tuple(w if k == at else np.zeros(w.shape) for k in range(3)) for w in waves)
+                lines = to_lines(self.fine, a, self.states, None, given)
         return np.stack([np.asarray(whitened(line, self.zero)) for line in lines], axis=1)
+
+    def _early(self, added, changes):
+        """Columns of what is added to every step, or to the drive."""
+        changed = through_march(self.predictor, marching(self.actuator), added, changes)
+        none = tuple((np.zeros(x.shape),) * 3 for x, *_ in changed)
+        return to_lines(self.predictor, self.actuator, self.fields, changed, none)
 
     def _waves(self, term, signals):
         return term.basis(*(np.asarray(signals[v]) for v in term.variables), xp=np)[0]

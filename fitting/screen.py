@@ -14,13 +14,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from magjax.chain import Timeline
-from magjax.chain.coupled import disturbance_of, magnetize
 from magjax.effects import CATALOGUE
-from magjax.simulate import driven_current, finish_chain
 
+from .columns import (
+    bare,
+    drive_change,
+    in_step_change,
+    late_change,
+    lines_of,
+    marching,
+    signals_of,
+    through_march,
+    to_lines,
+    trajectory,
+)
 from .joint import data_jacobian, data_residual
-from .model import predicted_lines, whitened
+from .model import whitened
 from .uncertainty import UNDERSMOOTH
 
 SHAPE_GRIDS = {
@@ -105,142 +114,58 @@ def applicable(actuator, quasistatic: bool = False):
     return found
 
 
-@eqx.filter_jit
-def _steady_state(predictor, actuator):
-    """Field and magnetization over the last period of every recording, grid by grid."""
-    return predictor.march(actuator)
+def _behind(classes, predictor, actuator, signals):
+    """(class, shapes) of all that act behind the hysteresis, and what they do there: per grid (free displacement, displacement, reading)."""
+    asked, rows = [], []
+    for c in classes:
+        if not c.in_step and c.block != "source":
+            shapes = shape_grid(c)
+            stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shapes))
+            asked += [(c, s) for s in shapes]
+            rows.append(late_change(stacked, predictor, actuator, signals))
+    return asked, jax.tree.map(lambda *x: jnp.concatenate(x), *rows)
 
 
-@eqx.filter_jit
-def _late_columns(predictor, actuator, states, effects):
-    """d lines / d amplitude of effects behind the hysteresis: no march, only the blocks after it.
+def _before(classes, predictor, own, path):
+    """(class, shapes) of all that act before the magnetostriction, and the change of (field, magnetization, current), per grid.
 
-    `effects`: of each kind one, its shapes stacked."""
-
-    def lines_of(effect, amplitude):
-        return predictor.lines(dataclasses.replace(actuator, effects=(*actuator.effects, effect.with_amplitude(amplitude))), states)
-
-    def column(effect):
-        return jax.jvp(lambda a: lines_of(effect, a), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
-
-    return [jax.vmap(column)(e) for e in effects]
-
-
-@eqx.filter_jit
-def _trajectory(predictor, actuator):
-    """Relay field, magnetization, coil current and step of the whole march of every recording, grid by grid."""
-
-    def one(drive, dt):
-        line = Timeline(dt, drive.shape[0], True)
-        current = driven_current(actuator, drive, line)
-        _, M, v, current = _march(predictor, actuator, current, dt)[:4]
-        return v, M, current, dt
-
-    return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
-
-
-def _march(predictor, actuator, current, dt, disturbance=None):
-    """(4) over all periods that the predictor runs: H, M, relay field, current, residual, overflow."""
-    table = actuator.hysteresis.table()
-    memory = actuator.hysteresis.memory(table, predictor.corners)
-    whole = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
-    H, M, v, residual, over = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, disturbance, len(current))
-    return H, M, v, whole[1], residual, over
-
-
-@eqx.filter_jit
-def _disturbance(effect, predictor, actuator, trajectory):
-    """d disturbance / d amplitude at null, (3 of (recordings, time)) per grid: the trajectory does not change."""
-
-    def one(v, M, current, dt):
-        def of(a):
-            return disturbance_of(effect.with_amplitude(a), actuator, v, M, current, dt, (len(v) - 1) // predictor.periods)
-
-        return jax.jvp(of, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
-
-    return tuple(jax.vmap(one)(*part) for part in trajectory)
-
-
-@eqx.filter_jit
-def _march_columns(predictor, actuator, directions):
-    """Change of the lines by disturbances of the march and changes of the drive, to first order, all in one program.
-
-    `directions`: per grid (disturbance (3 of (columns, recordings, time)), change of the current (columns, recordings, grid)).
-    """
-
-    def lines_of(disturbances, changes):
-        def one(drive, dt, given, change):
-            count = drive.shape[0]
-            line = Timeline(dt, count, True)
-            current = driven_current(actuator, drive, line) + change
-            H, M, v, _, res, over = _march(predictor, actuator, current, dt, given)
-            M = M + actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
-            H, M, v, res = (x[-count - 1 : -1] for x in (H, M, v, res))
-            s = finish_chain(actuator, line, drive, current, H, M, v, res, over)
-            return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / count
-
-        grids = zip(predictor.drives, predictor.steps, disturbances, changes, strict=True)
-        return jnp.concatenate([jax.vmap(one)(*g) for g in grids])[np.asarray(predictor.index)]
-
-    origin = jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), directions)
-    _, push = jax.linearize(lines_of, *origin)
-    return jax.lax.map(lambda d: push(*d), directions, batch_size=8)
+    `own`: the actuator with the effects that march; `path`: its trajectory."""
+    plain, asked, rows = bare(own), [], []
+    still = tuple(tuple(jnp.zeros_like(part[0]) for _ in range(3)) for part in path)
+    calm = tuple(jnp.zeros_like(d) for d in predictor.drives)
+    drives = [np.asarray(d) for d in predictor.drives]
+    for c in classes:
+        if c.block == "source":
+            for shapes in c.finite_trials(drives, predictor.steps) or shape_grid(c):
+                asked.append((c, shapes))
+                rows.append((still, drive_change(c(**shapes), predictor, plain, c.amplitude in shapes)))
+        elif c.in_step and not c.shells:
+            for shapes in shape_grid(c):
+                asked.append((c, shapes))
+                rows.append((in_step_change(c(**shapes), predictor, plain, path), calm))
+    return asked, through_march(predictor, own, *jax.tree.map(lambda *x: jnp.stack(x), *rows))
 
 
 def columns(problem, z):
     """First-order change of the whitened misfit by every applicable effect: list of (class, shapes, column)."""
     actuator = problem.layout.actuator(problem.template, jnp.asarray(z))
-    predictor = problem.predictors[0]
+    predictor, own = problem.predictors[0], marching(actuator)
     classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
-    found = []
-    late = [c for c in classes if not c.in_step and c.block != "source"]
-    if late:
-        stacked = tuple(
-            jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shape_grid(c))) for c in late
-        )
-        lines = _late_columns(predictor, actuator, _steady_state(predictor, actuator), stacked)
-        found += [
-            (c, shapes, line) for c, of in zip(late, lines, strict=True) for shapes, line in zip(shape_grid(c), of, strict=True)
-        ]
-    marching = [(c, shapes) for c in classes if c.in_step and not c.shells for shapes in shape_grid(c)]
-    drives = [np.asarray(d) for d in predictor.drives]
-    sources = [
-        (c, shapes) for c in classes if c.block == "source" for shapes in (c.finite_trials(drives, predictor.steps) or shape_grid(c))
-    ]  # fmt: skip
-    if marching or sources:
-        trajectory = _trajectory(predictor, actuator)
-        rows = []
-        for c, shapes in marching:
-            rows.append(
-                (_disturbance(c(**shapes), predictor, actuator, trajectory), tuple(jnp.zeros_like(d) for d in predictor.drives))
-            )
-        still = tuple(tuple(jnp.zeros_like(part[0]) for _ in range(3)) for part in trajectory)
-        for c, shapes in sources:
-            finite = c.amplitude in shapes
-            grids = zip(predictor.drives, predictor.steps, strict=True)
-            rows.append((still, tuple(_drive_change(c(**shapes), d, t, actuator, finite) for d, t in grids)))
-        lines = _march_columns(predictor, actuator, jax.tree.map(lambda *x: jnp.stack(x), *rows))
-        found += [(c, s, line) for (c, s), line in zip(marching + sources, lines, strict=True)]
+    fields, path = trajectory(predictor, own)
+    signals = signals_of(predictor, actuator, fields)
+    behind, late = _behind(classes, predictor, bare(actuator), signals)
+    before, early = _before(classes, predictor, own, path)
+    changes = jax.tree.map(lambda x: jnp.concatenate([jnp.zeros((len(behind), *x.shape[1:])), x]), early)
+    late = jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros((len(before), *x.shape[1:]))]), late)
+    asked, lines = behind + before, [np.asarray(to_lines(predictor, actuator, fields, changes, late))]
     for c in classes:
-        for shapes in c.finite_trials(drives, predictor.steps) if c.shells else ():
-            found.append(
-                (c, shapes, predicted_lines(predictor, actuator.with_effect(c(**shapes))) - predicted_lines(predictor, actuator))
-            )
+        for shapes in c.finite_trials([np.asarray(d) for d in predictor.drives], predictor.steps) if c.shells else ():
+            other, _ = trajectory(predictor, own.with_effect(c(**shapes)))
+            lines.append((lines_of(predictor, signals_of(predictor, actuator, other)) - lines_of(predictor, signals))[None])
+            asked.append((c, shapes))
     zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
-    return [(c, s, np.asarray(whitened(line, zero))) for c, s, line in found]
-
-
-@eqx.filter_jit
-def _drive_change(effect, drive, dt, actuator, finite):
-    """What a source effect does to the drive: its derivative at null, or, `finite`, all of it."""
-
-    def one(d, h):
-        line = Timeline(h, d.shape[0], True)
-        if finite:
-            return effect.drive(d, line, actuator) - d
-        return jax.jvp(lambda a: effect.with_amplitude(a).drive(d, line, actuator), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
-
-    return jax.vmap(one)(drive, dt)
+    whole = np.asarray(jax.vmap(whitened, (0, None))(np.concatenate(lines), zero))
+    return [(c, s, column) for (c, s), column in zip(asked, whole, strict=True)]
 
 
 class Projector:

@@ -12,6 +12,29 @@ NEWTON = 8  # steps to the displacement that a sample's friction allows; from th
 PASSES = 3  # over a period; each begins with the steady response to the friction of the one before
 
 
+def _turned(moved, p, law):
+    """The friction's share after a sample's motion, m; `law`: (stribeck, its way, viscous way, presliding way)."""
+    stribeck, fast, slow, way = law
+    top = 1 + stribeck * jnp.exp(-((moved / fast) ** 2))
+    keep = jnp.exp(-(jnp.abs(moved) + slow) / (way * top))
+    return top * jnp.tanh(moved / slow) * (1 - keep) + p * keep
+
+
+def _balance(moved, free, p, reach, law):
+    """moved + reach turned(moved, p) - free, and its slope."""
+    p_there, slope = jax.jvp(lambda m: _turned(m, p, law), (moved,), (jnp.ones_like(moved),))
+    return moved + reach * p_there - free, 1 + reach * slope
+
+
+@jax.jit  # traced once, though a sample asks for it many times
+def _closer(moved, low, high, free, p, reach, law):
+    """One safeguarded Newton step towards its zero: (moved, low, high)."""
+    left, slope = _balance(moved, free, p, reach, law)
+    low, high = jnp.where(left < 0, moved, low), jnp.where(left < 0, high, moved)
+    step = moved - left / slope
+    return jnp.where((step >= low) & (step <= high), step, 0.5 * (low + high)), low, high
+
+
 class CoulombFriction(AbstractEffect):
     """Friction as an equivalent displacement F/k: Dahl's law, viscous below a velocity, and LuGre's rise towards rest.
 
@@ -61,39 +84,29 @@ class CoulombFriction(AbstractEffect):
         rise = rise + coarse / (1 + coarse) * (gain - rise)
         reach = self.f * rise[0]  # what full friction takes back within the sample
 
-        def turned(moved, p):
-            top = 1 + self.stribeck * jnp.exp(-((moved / (line.dt * self.v_stribeck)) ** 2))
-            keep = jnp.exp(-(jnp.abs(moved) + slow) / (way * top))
-            return top * jnp.tanh(moved / slow) * (1 - keep) + p * keep
+        law = (self.stribeck, line.dt * self.v_stribeck, slow, way)
 
-        def balance(moved, free, p):
-            """moved + reach turned(moved, p) - free, and its slope."""
-            p_there, slope = jax.jvp(lambda m: turned(m, p), (moved,), (jnp.ones_like(moved),))
-            return moved + reach * p_there - free, 1 + reach * slope
-
-        def allowed(free, p):
+        def allowed(*given):
             """`moved` where that is zero; from the near end of where it can be Newton only approaches, but for Stribeck's."""
-            most = reach * (1 + self.stribeck)
-            at_rest = reach * turned(0.0, p)
+            free, p, reach, law = jax.lax.stop_gradient(given)
+            most = reach * (1 + law[0])
+            at_rest = reach * _turned(0.0, p, law)
             ahead = free > at_rest
             low = jnp.where(ahead, jnp.maximum(free - most, 0.0), free - at_rest)
             high = jnp.where(ahead, free - at_rest, jnp.minimum(free + most, 0.0))
             near = jnp.where(ahead, low, high)
             moved = jnp.where(near == 0, jnp.where(ahead, 1.0, -1.0) * 1e-300, near)
             for _ in range(NEWTON):
-                left, slope = balance(moved, free, p)
-                low, high = jnp.where(left < 0, moved, low), jnp.where(left < 0, high, moved)
-                step = moved - left / slope
-                moved = jnp.where((step >= low) & (step <= high), step, 0.5 * (low + high))
+                moved, low, high = _closer(moved, low, high, free, p, reach, law)
             return moved
 
         def advance(carry, linear):
             state, p, before = carry  # of the friction's own motion; turned share; displacement with friction
             rest = A @ state - (gain - rise) * self.f * p
             free = linear + rest[0] - before
-            moved = jax.lax.stop_gradient(allowed(*jax.lax.stop_gradient((free, p))))
-            left, slope = balance(moved, free, p)  # one differentiable step more
-            p = turned(moved - left / jax.lax.stop_gradient(slope), p)
+            moved = allowed(free, p, reach, law)
+            left, slope = _balance(moved, free, p, reach, law)  # one differentiable step more
+            p = _turned(moved - left / jax.lax.stop_gradient(slope), p, law)
             state = rest - rise * self.f * p
             return (state, p, linear + state[0]), (p, state[0])
 
@@ -101,10 +114,13 @@ class CoulombFriction(AbstractEffect):
         if not line.periodic:
             _, (_, own) = jax.lax.scan(advance, (state, p, displacement[0]), displacement)
             return displacement + own
-        for _ in range(PASSES):
+
+        def again(_, begin):
+            state, p, _ = begin
             (_, p, _), (late, _) = jax.lax.scan(advance, (state, p, displacement[-1] + state[0]), displacement)
             force = -self.f * late
             own = line.filter(force, mechanics.response)
             velocity = line.filter(force, lambda s: mechanics.response(s) * s / (2 * jnp.pi * mechanics.f0))
-            state = jnp.stack([own[-1], velocity[-1]])
-        return displacement + own
+            return jnp.stack([own[-1], velocity[-1]]), p, own
+
+        return displacement + jax.lax.fori_loop(0, PASSES, again, (state, p, jnp.zeros_like(displacement)))[2]
