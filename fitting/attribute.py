@@ -127,19 +127,27 @@ def settled(task, base, trial, excess, target: float = np.inf) -> Trial:
 
 
 def _in_detail(task, base, trial, excess) -> Trial:
-    """The trial with the details of its effect's law where it takes a part of the misfit and leaves some, and they take more."""
-    result = trial.result
-    if not (trial.explained_share > DETAIL_SHARE and result.chi2_per_sample > MISFIT):
-        return trial
-    effect = result.actuator.effect(trial.name).in_detail()
-    if effect is None:
-        return trial
-    same = {"choices": result.choices, "spectra": base.spectra}
-    finer = task.fit_on(result, result.actuator.with_effect(effect), **same)
-    if not finer.converged:
-        finer = task.fit_on(finer, finer.actuator, **same)
-    finer = credited(trial.candidate, finer, base, effect, excess)
-    return finer if finer.bic_change < trial.bic_change - BIC_DROP else trial
+    """The trial with the details of its effect's law, and from elsewhere, where it takes a part of the misfit and leaves some, and
+    these take more."""
+    best = trial
+    for start, of in _further_starts(base, trial):
+        result = best.result
+        if not (best.explained_share > DETAIL_SHARE and result.chi2_per_sample > MISFIT):
+            break
+        same = {"choices": result.choices, "spectra": base.spectra}
+        finer = task.fit_on(of, of.actuator.with_effect(start), **same)
+        if not finer.converged:
+            finer = task.fit_on(finer, finer.actuator, **same)
+        finer = credited(trial.candidate, finer, base, start, excess)
+        best = finer if finer.bic_change < best.bic_change - BIC_DROP else best
+    return best
+
+
+def _further_starts(base, trial):
+    """Effects to begin a further fit with, each with the fit to go on from."""
+    effect = trial.result.actuator.effect(trial.name)
+    detailed = effect.in_detail()
+    return [(detailed, trial.result)] * (detailed is not None) + [(other, base) for other in effect.elsewhere()]
 
 
 def credited(candidate, result, base, effect, excess) -> Trial:

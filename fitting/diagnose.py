@@ -46,6 +46,10 @@ ABSORBED_VISIBILITY = 0.004
 LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
+UNPROMISED, VALLEY = (
+    3.0,
+    0.3,
+)  # times what any effect promised, that effects take where the plain fit is tried from there; its share of it
 COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
@@ -149,16 +153,19 @@ def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
     checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
     plain, candidates = _screened_finer(task, plain, candidates, free)
     place = where(plain, candidates, task.recordings, task.bench.output)
-    hummed = []
+    anew = []  # what the diagnosis begins anew with: recordings without a hum that showed beside an effect, or a better plain fit
 
-    def hums(current) -> bool:
-        hummed[:] = [found for found in [_hum_on_harmonics(task, adopted, current)] if found]
-        return bool(hummed)
+    def begins_anew(current) -> bool:
+        if found := _hum_on_harmonics(task, adopted, current):
+            cleaned, hum, _ = found
+            anew.append((cleaned, measured, [*adopted, hum], check))
+        elif zero is None and (better := _better_valley(task, plain, candidates, current)):
+            anew.append((task, measured, adopted, check, better))
+        return bool(anew)
 
-    reached = search(task, plain, candidates, checks[1], hums)
-    if hummed:  # beside an effect: begun anew without it
-        cleaned, hum, _ = hummed[0]
-        return _examined(cleaned, measured, [*adopted, hum], check)
+    reached = search(task, plain, candidates, checks[1], begins_anew)
+    if anew:
+        return _examined(*anew[-1])
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried),
@@ -246,6 +253,22 @@ def _hum_on_harmonics(task, adopted, base, candidates=()):
     if chi2_of(freed) > chi2_of(base) - MOST_OF_IT * excess:
         return None
     return cleaned, (effect, []), freed
+
+
+def _better_valley(task, plain, candidates, current):
+    """The plain fit from where that with effects ended, if it falls far: it had settled in a valley of its density, and an effect
+    was credited with the way out. Asked where the effects take far more than any promised to first order. None elsewhere.
+    """
+    drop = chi2_of(plain) - chi2_of(current)
+    if drop < UNPROMISED * max(c.z**2 for c in candidates):
+        return None
+    task.say("the plain model from there", current.chi2_per_sample)
+    held = {e.name for e in plain.actuator.effects}
+    actuator = current.actuator
+    for effect in current.actuator.effects:
+        actuator = actuator if effect.name in held else actuator.without_effect(effect.name)
+    better = task.fit_on(current, actuator, choices=current.choices)
+    return better if chi2_of(better) < chi2_of(plain) - max(MIN_DROP, VALLEY * drop) else None
 
 
 def _own_zeros(task, adopted, base, candidates):

@@ -45,7 +45,7 @@ SHAPE_GRIDS = {
     "creep": {"shortest": (1e-4, 1e-2), "mean_behind": (0.0, 4.0)},
     "coulomb_friction": {"v_s": (1e-5, 1e-3), "presliding": (1e-8, 1e-7, 1e-6)},
     "sensor_lag": {"order2": (0.0, 0.5)},
-    "sensor_nonlinearity": {"c3": (-1.2, 0.0, 3.0)},
+    "sensor_nonlinearity": {"c3": (-1.2, 0.0, 3.0), "c0": (-0.3, 0.0, 0.3)},
 }
 
 

@@ -384,3 +384,53 @@ def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch
     found = fitting.attribute.settled(task, SimpleNamespace(spectra=None), plain, 1.0)
     assert (found is not plain) == detailed and bool(asked) == (share > 0.3)
     assert all(float(effect.stribeck) > 0 for effect in asked)
+
+
+def test_a_plain_fit_that_settled_in_a_valley_is_begun_anew_from_where_effects_led():
+    """An effect that takes far more than any promised to first order was credited with the way out of it."""
+    from fitting.diagnose import _better_valley
+    from magjax.bench import load_bench
+    from magjax.effects import Creep
+
+    rod = load_bench("aa-050h").actuator()
+    plain = SimpleNamespace(chi2_per_sample=4.4, data_count=COUNT, actuator=rod, spectra=(), choices=Choices())
+    moved = SimpleNamespace(chi2_per_sample=1.0, data_count=COUNT, actuator=rod.with_effect(Creep()), spectra=(), choices=Choices())
+    asked = []
+
+    class Told(Task):
+        def fit_on(self, start, actuator=None, **more):
+            asked.append((start, actuator.effects))
+            return SimpleNamespace(chi2_per_sample=self.recordings[0], data_count=COUNT)
+
+    found = _better_valley(Told((1.3,), None), plain, [candidate("creep", 9.0)], moved)
+    assert found.chi2_per_sample == 1.3 and asked == [(moved, ())]
+    # a fit that falls little was at its best, and one effect that kept its promise is not asked about
+    assert _better_valley(Told((4.0,), None), plain, [candidate("creep", 9.0)], moved) is None and len(asked) == 2
+    assert _better_valley(Told((1.3,), None), plain, [candidate("creep", 40.0)], moved) is None and len(asked) == 2
+
+
+@pytest.mark.parametrize(
+    ("ends", "fits"), [((2.0, 1.0), 2), ((1.0, 9.9), 1)], ids=["from elsewhere too", "the detail meets the noise"]
+)
+def test_a_law_whose_first_order_misleads_is_fitted_from_elsewhere_too(ends, fits):
+    from magjax.bench import load_bench
+
+    rod, kind = load_bench("aa-050h").actuator(), CLASSES["duffing_stiffness"]
+    base = SimpleNamespace(chi2_per_sample=30.0, data_count=COUNT, actuator=rod, spectra=(), choices=Choices())
+    result = SimpleNamespace(
+        chi2_per_sample=9.0, data_count=COUNT, converged=True, actuator=rod.with_effect(kind(k3=-0.2)), choices=Choices()
+    )
+    first = Trial(candidate("duffing_stiffness", 50.0), result, 21.0 * COUNT, -21.0 * COUNT, True, 0.7, 2)
+    begun = []
+
+    class Told(Task):
+        def fit_on(self, start, actuator=None, **more):
+            begun.append((start is base, float(actuator.effect("duffing_stiffness").k3)))
+            found = SimpleNamespace(
+                chi2_per_sample=ends[len(begun) - 1], data_count=COUNT, converged=True, actuator=actuator, choices=Choices()
+            )
+            found.estimate = lambda name: SimpleNamespace(value=float(actuator.effect("duffing_stiffness").k3))
+            return found
+
+    found = fitting.attribute.settled(Told((), None), base, first, 29.0 * COUNT)
+    assert begun == [(False, -0.2), (True, 0.6)][:fits] and found.result.chi2_per_sample == 1.0

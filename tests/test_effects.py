@@ -120,6 +120,48 @@ def test_friction_against_its_equation_in_time(f, v_s, presliding, stribeck, tol
     assert rms(np.asarray(record.displacement)[2 * N :] - np.asarray(signals.displacement)) < 2 * tolerance * rms(without - exact)
 
 
+@pytest.mark.parametrize("effect", [
+    effects.DuffingStiffness(k3=2.0, k5=0.2, rest=0.1), effects.DuffingStiffness(k3=-0.15), effects.DeltaE(e=0.8, static=0.7), effects.DeltaE(e=-0.5),
+], ids=["stiffens", "softens", "gives way", "stays"])  # fmt: skip
+@pytest.mark.parametrize("periodic", [True, False])
+def test_a_strong_spring_of_a_lightly_damped_rod_against_its_equation_in_time(effect, periodic):
+    """Its stiffness changes by several times the damping ratio: there a fixed point swings up."""
+    from scipy.integrate import solve_ivp
+    from scipy.optimize import brentq
+
+    act = actuator(20).replace({"mechanics.f0": 1500.0, "mechanics.xi": 0.1})
+    reach, f, n, turns = float(act.strained.reach), 250.0, 512, 1 if periodic else 4
+    line = Timeline(jnp.asarray(1 / (f * n)), turns * n, periodic)
+    times = np.arange(turns * n) / (f * n)
+
+    def free(t):
+        return reach * (0.35 + 0.3 * np.sin(2 * np.pi * f * t) + 0.02 * np.cos(4 * np.pi * f * t))
+
+    def square(t):
+        return 0.4 + 0.3 * np.sin(2 * np.pi * f * t - 0.4)
+
+    if effect.name == "delta_e":
+        force = lambda t, y: -float(effect.e) * square(t) * (y - (1 - float(effect.static)) * free(t))
+    else:
+        ratio = lambda y: y / reach - float(effect.rest)
+        force = lambda t, y: -reach * float(effect.k3) * ratio(y) ** 3 * (1 + float(effect.k5) * ratio(y) ** 2)
+    given = jnp.asarray(free(times))
+    signals = {"magnetization": act.magnetostriction.M_s * jnp.sqrt(jnp.asarray(square(times)))}
+    found = effect.displacement(act.mechanics(given, line), given, signals, line, act)
+    rest = brentq(lambda y: y - free(0) - force(0, y), -2 * reach, 2 * reach)
+    w0, start = 2 * np.pi * 1500.0, 30 / f if periodic else 0.0
+
+    def rate(t, state):
+        y, v = state
+        return v, w0**2 * (free(t) + force(t, y) - y) - 2 * 0.1 * w0 * v
+
+    exact = solve_ivp(
+        rate, (0, start + times[-1]), [rest, 0], "LSODA", start + times, rtol=1e-9, atol=1e-15, max_step=1 / (50 * f)
+    ).y[0]
+    assert np.abs(exact - np.asarray(act.mechanics(given, line))).max() > 0.01 * np.ptp(exact)  # it does change the motion
+    assert np.abs(np.asarray(found) - exact).max() < (1e-6 if periodic else 1e-4) * np.ptp(exact)
+
+
 def test_a_rod_that_sticks_stays_calm_on_a_coarse_grid():
     act = dataclasses.replace(actuator(20), mechanics=Mechanics(jnp.asarray(400.0), jnp.asarray(0.1)))
     effect = effects.CoulombFriction(f=1.2e-6, v_s=1e-6, presliding=1.5e-7)

@@ -90,6 +90,11 @@ class AbstractEffect(eqx.Module):
             return None
         return dataclasses.replace(self, **{n: info.scale for n, info in kept.items() if info.default == 0})
 
+    @classmethod
+    def elsewhere(cls) -> tuple:
+        """Where else a fit may begin, far from the null, for laws whose first order misleads: effects with all their parameters."""
+        return ()
+
     @property
     def marches(self) -> bool:
         """Whether it changes the field or the magnetization: all that stand before the magnetostriction do."""

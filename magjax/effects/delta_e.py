@@ -35,4 +35,9 @@ class DeltaE(AbstractEffect):
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with a stiffness that follows m^2, m."""
         square = (signals["magnetization"] / actuator.magnetostriction.M_s) ** 2
-        return with_force(displacement, lambda y: -self.e * square * (y - (1 - self.static) * free_displacement), line, actuator)
+
+        def spring(y, effect, series):
+            square, free = series
+            return -effect.e * square * (y - (1 - effect.static) * free)
+
+        return with_force(displacement, spring, self, (square, free_displacement), line, actuator)

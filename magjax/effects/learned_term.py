@@ -153,15 +153,16 @@ class LearnedTerm(AbstractEffect):
         if self.place != "mechanics":
             return displacement
 
-        def force(y):
-            return self._of(
+        def force(y, term, series):
+            magnetization, free = series
+            return term._of(
                 {
-                    "displacement": lambda: y, "displacement_rate": lambda: line.derivative(y), "magnetization": lambda: signals["magnetization"],
-                    "stretch": lambda: y - free_displacement,
+                    "displacement": lambda: y, "displacement_rate": lambda: line.derivative(y), "magnetization": lambda: magnetization,
+                    "stretch": lambda: y - free,
                 }
             )  # fmt: skip
 
-        return with_force(displacement, force, line, actuator)
+        return with_force(displacement, force, self, (signals["magnetization"], free_displacement), line, actuator, local=False)
 
     def reading(self, reading, signals, line, actuator):
         """Reading with the term."""

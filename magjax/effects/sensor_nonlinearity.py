@@ -22,10 +22,13 @@ class SensorNonlinearity(AbstractEffect):
     c6: Float[Array, ""] = param(
         0.0, "1", "departure of sixth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
     )
+    c0: Float[Array, ""] = param(
+        0.0, "1", "departure at zero relative to the quadratic one", scale=0.2, shape=True, typical=(-1.0, 1.0)
+    )
 
     name = "sensor_nonlinearity"
     block = "sensor"
-    law = "reading = y + l q2 r^2 (1 + c3 r + c4 r^2 + c5 r^3 + c6 r^4), r = y/l, l = saturation displacement"
+    law = "reading = y + l q2 (c0 + r^2 (1 + c3 r + c4 r^2 + c5 r^3 + c6 r^4)), r = y/l, l = saturation displacement"
     source = "linearity error of LVDTs, as in their data sheets"
     signature = "distortion that is a function of y alone at every frequency; a free density absorbs it at low frequency"
     amplitude = "q2"
@@ -34,6 +37,5 @@ class SensorNonlinearity(AbstractEffect):
         """Reading through the curve."""
         reach = actuator.strained.reach if actuator.strained is not None else 1.0
         part = reading / reach
-        return reading + reach * part * part * self.q2 * (
-            1 + part * (self.c3 + part * (self.c4 + part * (self.c5 + part * self.c6)))
-        )
+        curve = part * part * (1 + part * (self.c3 + part * (self.c4 + part * (self.c5 + part * self.c6))))
+        return reading + reach * self.q2 * (self.c0 + curve)

@@ -1,0 +1,57 @@
+"""The screening's first-order columns against derivatives of the whole chain."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import magjax.effects as effects
+from fitting.demo import record
+from fitting.model import predicted_lines, whitened
+from fitting.screen import applicable, columns, shape_grid
+from fitting.setup import Choices, build_problem, free_parameters, spectra_of
+from magjax.bench import load_bench
+
+SMALL = Choices(fine=128, coarse=90, knots=(6, 5), level=24, rest="negative")
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    rng = np.random.default_rng(0)
+    return [record(load_bench("aa-050h").actuator(), f, 0.6, 0.05, rng, f"{f}") for f in (20.0, 200.0)]
+
+
+ONE_OF_EACH = (effects.SecondEddyPath, effects.AmplifierLag, effects.StrainHysteresis, effects.DeltaE, effects.InductiveCrosstalk)
+
+
+@pytest.mark.parametrize(
+    "kinds", [ONE_OF_EACH, pytest.param(effects.CATALOGUE, marks=pytest.mark.long)], ids=["one of each", "all"]
+)
+def test_are_those_of_the_whole_chain(recordings, kinds):
+    bench = load_bench("aa-050h")
+    actuator = bench.actuator()
+    for effect in (effects.SensorLag(tau=1e-4), effects.ExcessLoss(k=20.0)):
+        actuator = actuator.with_effect(effect)
+    spectra = spectra_of(recordings, bench, SMALL.harmonics)
+    problem, z = build_problem(spectra, actuator, bench, free_parameters(bench, actuator, ()), SMALL, None)
+    at = problem.layout.actuator(problem.template, jnp.asarray(z))
+    target = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
+    found = {}
+    for kind, shapes, column in columns(problem, z):
+        found.setdefault(kind, []).append((shapes, column))
+    asked = [k for k in applicable(actuator) if not k.record_level]
+    assert set(found) == set(asked) and len(asked) > 20
+    for kind in [k for k in asked if k in kinds]:
+        shapes, column = found[kind][-1]
+        assert len(found[kind]) == len(shape_grid(kind)) or kind.amplitude in shapes
+        effect = kind(**shapes)
+        if kind.amplitude in shapes:  # scored at a finite size
+            whole = predicted_lines(problem.predictors[0], at.with_effect(effect)) - predicted_lines(problem.predictors[0], at)
+        else:
+            act = lambda a, e=effect: at.with_effect(e.with_amplitude(a))
+            whole = jax.jvp(lambda a, act=act: predicted_lines(problem.predictors[0], act(a)), (0.0,), (1.0,))[1]
+        whole = np.asarray(whitened(whole, target))
+        assert np.linalg.norm(whole) > 0
+        near = 0.1 if kind is effects.AmplifierClipping else 1e-6  # all of the change of the drive, carried on to first order
+        assert np.linalg.norm(column - whole) < near * np.linalg.norm(whole), kind.name
