@@ -59,26 +59,27 @@ def trajectory(predictor, actuator):
 
 
 @eqx.filter_jit
-def in_step_change(effect, predictor, actuator, path):
-    """d (what is added to every step) / d amplitude of an effect at null, 3 of (recordings, time) per grid, along a `trajectory`."""
+def in_step_change(effect, predictor, actuator, path, finite: bool):
+    """What an effect adds to every step along a `trajectory`, 3 of (recordings, time) per grid: its derivative at null, or, `finite`,
+    all of it."""
 
     def one(v, M, current, dt):
-        def of(a):
-            return disturbance_of(effect.with_amplitude(a), actuator, v, M, current, dt, (len(v) - 1) // predictor.periods)
+        def of(effect):
+            return disturbance_of(effect, actuator, v, M, current, dt, (len(v) - 1) // predictor.periods)
 
-        return jax.jvp(of, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
+        if finite:
+            return of(effect)
+        return jax.jvp(lambda a: of(effect.with_amplitude(a)), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
     return tuple(jax.vmap(one)(*part) for part in path)
 
 
 @eqx.filter_jit
-def drive_change(effect, predictor, actuator, finite: bool):
-    """What a source effect does to the drive, per grid, (recordings, samples): its derivative at null, or, `finite`, all of it."""
+def drive_change(effect, predictor, actuator):
+    """d drive / d amplitude of a source effect at null, per grid, (recordings, samples)."""
 
     def one(drive, dt):
         line = Timeline(dt, drive.shape[0], True)
-        if finite:
-            return effect.drive(drive, line, actuator) - drive
         return jax.jvp(lambda a: effect.with_amplitude(a).drive(drive, line, actuator), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
     return tuple(jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True))

@@ -36,6 +36,7 @@ SHAPE_GRIDS = {
     "amplifier_lag": {"order2": (0.25,)},
     "excess_loss": {"rate_knee": (0.3, 10.0, 100.0)},
     "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3), "air": (0.05, 0.9)},
+    "stress_feedback": {"inertia": (0.0, 5.0)},
     "magnetic_aftereffect": {"of_field": (0.05, 0.9)},
     "rate_dependent_switching": {"rate0": (1e3, 3e4, 1e6), "of_flux": (0.05, 0.9)},
     "second_mode": {"f2": tuple(150.0 * 1.09**k for k in range(36)), "xi2": (0.02, 0.1)},  # a mode is narrow
@@ -135,14 +136,14 @@ def _before(classes, predictor, own, path):
     calm = tuple(jnp.zeros_like(d) for d in predictor.drives)
     drives = [np.asarray(d) for d in predictor.drives]
     for c in classes:
-        if c.block == "source":
-            for shapes in c.finite_trials(drives, predictor.steps) or shape_grid(c):
-                asked.append((c, shapes))
-                rows.append((still, drive_change(c(**shapes), predictor, plain, c.amplitude in shapes)))
-        elif c.in_step and not c.shells:
-            for shapes in shape_grid(c):
-                asked.append((c, shapes))
-                rows.append((in_step_change(c(**shapes), predictor, plain, path), calm))
+        if c.shells or not (c.in_step or c.block == "source"):
+            continue
+        for shapes in c.finite_trials(drives, predictor.steps) or shape_grid(c):
+            asked.append((c, shapes))
+            if c.in_step:
+                rows.append((in_step_change(c(**shapes), predictor, plain, path, c.amplitude in shapes), calm))
+            else:
+                rows.append((still, drive_change(c(**shapes), predictor, plain)))
     return asked, through_march(predictor, own, *jax.tree.map(lambda *x: jnp.stack(x), *rows))
 
 

@@ -100,6 +100,8 @@ def march_chain(actuator, line, current, periods: int, corners: int, scheme: str
 def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, unsettled=0.0) -> Signals:
     """The blocks after the hysteresis: magnetostriction, mechanics, sensor, with their effects."""
     B = MU0 * (H + M)
+    for effect in actuator.effects:
+        current = effect.delivered(current, B, line, actuator)
     if actuator.piezo is not None:
         M = actuator.piezo.polarization(M, H)
     signals = {"command": command, "current": current, "field": H, "magnetization": M, "flux_density": B}

@@ -80,14 +80,22 @@ def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():
     assert [e.name for e in again.effects] == ["duffing_stiffness", "backlash"] and float(again.effects[0].k3) == 0.1
 
 
-def test_a_limited_voltage_bounds_the_current():
-    command = np.asarray(CURRENT)
-    effect = effects.AmplifierClipping(inverse_limit=1 / 0.6, tau_L=2e-3)
-    current = np.asarray(effect.drive(CURRENT, Timeline(jnp.asarray(DT), N, True), None))
-    voltage = current + 2e-3 * (current - np.roll(current, 1)) / DT
-    assert np.abs(voltage).max() == pytest.approx(0.6, rel=1e-9) and np.abs(command).max() > 0.65
-    free = np.abs(voltage) < 0.6 * (1 - 1e-9)
-    assert 0.1 < free.mean() < 0.9 and np.array_equal(current[free], command[free])
+@pytest.mark.parametrize("linkage", [0.0, 4e-3])
+def test_a_limited_voltage_bounds_the_current(linkage):
+    command, limit = np.asarray(CURRENT), 0.6
+    effect = effects.AmplifierClipping(inverse_limit=1 / limit, tau_L=2e-3, linkage=linkage)
+    act = actuator(20).with_effect(effect)
+    found = run_chain(act, CURRENT, DT, 4, 4)
+    current, B = np.asarray(found.current), np.asarray(found.flux_density)
+    voltage = current + 2e-3 * (current - np.roll(current, 1)) / DT + linkage * (B - np.roll(B, 1)) / DT
+    assert np.abs(voltage).max() == pytest.approx(limit, rel=1e-5) and np.abs(command).max() > 0.65
+    free = np.abs(voltage) < limit * (1 - 1e-4)
+    assert 0.05 < free.mean() < 0.95 and np.abs(current - command)[free].max() < 1e-12
+    # the field is that of this current: without the effect, driven by it
+    alone = run_chain(dataclasses.replace(act, effects=()), found.current, DT, 4, 4)
+    assert np.abs(np.asarray(found.field - alone.field)).max() < 1e-6 * np.ptp(np.asarray(alone.field))
+    other = run_chain(act.replace({"effects.amplifier_clipping.linkage": 0.0}), CURRENT, DT, 4, 4).current
+    assert (linkage > 0) == (np.abs(current - np.asarray(other)).max() > 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -255,3 +263,19 @@ def test_a_second_path_round_the_coil_filters_the_drive():
     outside = np.asarray(run_chain(act, filtered, DT, 4, 4, "bdf2").reading)
     without = np.asarray(run_chain(act, CURRENT, DT, 4, 4, "bdf2").reading)
     assert np.abs(inside - outside).max() < 0.03 * np.abs(outside - without).max()
+
+
+def test_the_stress_of_a_moved_mass_is_that_of_its_acceleration():
+    """A stress of rod and mass that follow slowly is that of the spring alone; through the resonance it turns round."""
+    act = actuator(20).replace({"mechanics.f0": 1500.0, "mechanics.xi": 0.1})
+    line = Timeline(jnp.asarray(DT), N, True)
+    for inertia in (0.0, 4.0):
+        found = run_chain(act.with_effect(effects.StressFeedback(stiffness=2e11, inertia=inertia)), CURRENT, DT, 3, 4)
+        y = np.asarray(found.displacement)
+        rate = np.asarray(line.derivative(found.displacement))
+        acceleration = np.asarray(line.derivative(jnp.asarray(rate))) / (2 * np.pi * 1500.0) ** 2
+        rod = act.magnetostriction
+        shift = 2e11 * (y + inertia * acceleration) * 3 * float(rod.lambda_s) / (4e-7 * np.pi * float(rod.M_s) ** 2)
+        shift = shift * np.asarray(found.magnetization)
+        felt = np.asarray(found.field - found.relay_field)
+        assert np.abs(felt).max() > 10 and np.abs(felt - shift).max() < 0.03 * np.ptp(shift)

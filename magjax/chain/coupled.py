@@ -27,6 +27,7 @@ from ..preisach.everett import take
 from ..preisach.memory import Memory, apply_field, branch_magnetization
 
 SCHEMES = ("bdf2", "trapezoid")
+LOSSES = ("source", "coil")  # blocks whose effects take from the applied field
 CLOSE_ENOUGH = 1e-12  # of half the plane; the polish squares what is left
 MOST_STEPS = 60  # a bisection alone gets there
 
@@ -169,7 +170,7 @@ def _extra_terms(effects, states, actuator, trial, p, q):
     shift = loss = added = jnp.zeros_like(trial.field)
     for effect, state in zip(effects, states, strict=True):
         added = added + effect.magnetization(trial, state, actuator)
-        if effect.block == "coil":
+        if effect.block in LOSSES:
             loss = loss + effect.field_shift(trial, state, actuator)
         else:
             shift = shift + effect.field_shift(trial, state, actuator)
@@ -332,7 +333,7 @@ def disturbance_of(effect, actuator, field, magnetization, current, h, period: i
         change = (1.5 * X1 - 2 * X0 + 0.5 * X_before) if bdf else X1 - X0
         trial = Trial(v, m, scale * change, (v - before) / h, drive, h)
         shift, added = effect.field_shift(trial, state, actuator), effect.magnetization(trial, state, actuator)
-        loss = effect.block == "coil"
+        loss = effect.block in LOSSES
         row = (zero if loss else shift, added, shift if loss else zero)
         (state,), (mark,) = _settle((effect,), (effect.advance(trial, state, actuator),), (mark,), end, period * h)
         return (state, mark, X1, X0, v), row

@@ -1,4 +1,4 @@
-"""source: the amplifier's voltage is bounded, |L dI/dt + R I| <= V_max."""
+"""source: the amplifier's voltage is bounded, |L dI/dt + R I + N A dB/dt| <= V_max."""
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,12 @@ NO_LIMIT = 1e6  # A: voltage over resistance that no bench asks for
 
 
 class AmplifierClipping(AbstractEffect):
-    """A supply of limited voltage: the current follows its command while R I + L dI/dt stays within +-V_max, else it
+    """A supply of limited voltage: the current follows its command while R I + L dI/dt + N A dB/dt stays within +-V_max, else it
     moves as that voltage lets it and meets the command again later.
 
-    The exact law of the current, by the implicit Euler step; with g = R / V_max a limit that nothing reaches is no limit, so
-    there is no derivative at null: the screening tries limits just below what the recordings ask for. Left out: the
-    voltage N A dB/dt beyond its linear part, which tau_L holds.
+    The exact law, inside the step of (4), for the flux answers the current; L is of what the rod does not fill. With g = R / V_max a
+    limit that nothing reaches is no limit, so there is no derivative at null: the screening tries limits just below what the
+    recordings ask for. In detail the flux of the rod counts, which otherwise tau_L stands for.
     """
 
     inverse_limit: Float[Array, ""] = param(
@@ -30,14 +30,18 @@ class AmplifierClipping(AbstractEffect):
         typical=(0.3, 3.0),
     )
     tau_L: Float[Array, ""] = param(1e-3, "s", "L/R of coil and leads", low=0.0, scale=1e-3, shape=True, typical=(1e-4, 1e-2))
+    linkage: Float[Array, ""] = param(
+        0.0, "A s/T", "turns times area over resistance", low=0.0, scale=5e-3, shape=True, detail=True, typical=(1e-3, 5e-2)
+    )
 
     name = "amplifier_clipping"
     block = "source"
-    law = "|I + tau_L dI/dt| <= 1 / g, I = command wherever that allows it"
-    source = "voltage compliance of a linear amplifier, |L dI/dt + R I| <= V_max"
+    law = "|I + tau_L dI/dt + linkage dB/dt| <= 1 / g, I = command wherever that allows it"
+    source = "voltage compliance of a linear amplifier, |L dI/dt + R I + N A dB/dt| <= V_max"
     signature = "flattened crests at the largest amplitude, at high frequency first; nothing below the limit"
     amplitude = "inverse_limit"
     magnetic = True
+    in_step = True
 
     @classmethod
     def finite_trials(cls, drives, steps):
@@ -51,15 +55,36 @@ class AmplifierClipping(AbstractEffect):
             found += [{"tau_L": tau, "inverse_limit": 1 / (share * peak)} for share in (0.97, 0.9, 0.75)]
         return found
 
-    def drive(self, current, line, actuator):
-        """Current as the voltage lets it follow."""
+    def _current(self, command, before, flux_rate, h):
         limit = 1 / jnp.maximum(self.inverse_limit, 1 / NO_LIMIT)
-        a = self.tau_L / line.dt
+        a = self.tau_L / h
+        middle, room = (a * before - self.linkage * flux_rate) / (1 + a), limit / (1 + a)
+        return jnp.clip(command, middle - room, middle + room)
 
-        def follow(before, command):
-            now = jnp.clip(command, (a * before - limit) / (1 + a), (a * before + limit) / (1 + a))
-            return now, now
+    def start(self, trial, actuator):
+        """(current, field that it falls short of) at rest."""
+        current = self._current(trial.current, trial.current, 0.0, jnp.inf)
+        return current, actuator.coil.applied_field(trial.current) - actuator.coil.applied_field(current)
 
-        first = current[-1] if line.periodic else current[0]
-        last, once = jax.lax.scan(follow, first, current)
-        return jax.lax.scan(follow, last, current)[1] if line.periodic else once
+    def field_shift(self, trial, state, actuator):
+        """Applied field that the current falls short of, A/m."""
+        short = self.advance(trial, state, actuator)[1]
+        return short if actuator.coil.scheme == "bdf2" else 0.5 * (short + state[1])
+
+    def advance(self, trial, state, actuator):
+        """The current after the step, and the field that it falls short of."""
+        current = self._current(trial.current, state[0], trial.flux_rate, trial.h)
+        return current, actuator.coil.applied_field(trial.current) - actuator.coil.applied_field(current)
+
+    def delivered(self, current, flux_density, line, actuator):
+        """The current, A, for the flux density that it made."""
+        B = jnp.pad(flux_density, (2, 0), "wrap" if line.periodic else "edge")
+        bdf = actuator.coil.scheme == "bdf2"
+        rate = (1.5 * B[2:] - 2 * B[1:-1] + 0.5 * B[:-2] if bdf else B[2:] - B[1:-1]) / line.dt
+
+        def follow(before, now):
+            there = self._current(now[0], before, now[1], line.dt)
+            return there, there
+
+        last, once = jax.lax.scan(follow, current[-1] if line.periodic else current[0], (current, rate))
+        return jax.lax.scan(follow, last, (current, rate))[1] if line.periodic else once

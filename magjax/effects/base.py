@@ -5,7 +5,8 @@ overrides the hooks of its block only; all others are identities. Adding one is 
 
 hook            block                   acts on
 drive           source                  the current on its way to the coil (whole signal)
-field_shift     coil, hysteresis        the field inside the implicit step of (4)
+delivered       source                  the same, where the flux answers it (whole signal, after the step)
+field_shift     source, coil, hysteresis  the field inside the implicit step of (4)
 magnetization   hysteresis              what is added to the Preisach magnetization inside the step
 strain          magnetostriction        the free displacement (whole signal)
 displacement    mechanics               the displacement (whole signal)
@@ -112,12 +113,16 @@ class AbstractEffect(eqx.Module):
         """Current after this effect, A, (time,)."""
         return current
 
+    def delivered(self, current, flux_density, line, actuator):
+        """Current in the coil, A, (time,), where an effect inside the step changes it; `flux_density`: T, (time,)."""
+        return current
+
     def start(self, trial: Trial, actuator):
         """Internal state at equilibrium before the first step: any tuple of scalars."""
         return ()
 
     def field_shift(self, trial: Trial, state, actuator):
-        """What must be added to the relays' field to give the field H in (4), A/m; a loss if the block is the coil."""
+        """What must be added to the relays' field to give the field H in (4), A/m; a loss if the block is the source or the coil."""
         return jnp.zeros_like(trial.field)
 
     def magnetization(self, trial: Trial, state, actuator):

@@ -9,15 +9,27 @@ from .base import AbstractEffect
 
 
 class StressFeedback(AbstractEffect):
-    """The relays see H + (3 lambda_s sigma/(mu0 M_s^2)) M with sigma = -stiffness y from the mechanics (5)."""
+    """The relays see H + (3 lambda_s sigma/(mu0 M_s^2)) M with sigma = -stiffness (y + inertia y''/w0^2) from the mechanics (5).
+
+    In detail the rod bears a mass beside its spring: inertia is the stiffness of rod and spring together over that of the spring.
+    """
 
     stiffness: Float[Array, ""] = param(
         0.0, "Pa/m", "stress in the rod per displacement (preload spring, load)", low=0.0, scale=1e10, null=0.0, typical=(1e9, 1e12)
     )
+    inertia: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "stress of the moved mass over that of the spring, by y''/w0^2 over y",
+        scale=1.0,
+        shape=True,
+        detail=True,
+        typical=(0.0, 20.0),
+    )
 
     name = "stress_feedback"
     block = "hysteresis"
-    law = "M = Gamma[H + (3 lambda_s sigma / (mu0 M_s^2)) M], sigma = -stiffness y"
+    law = "M = Gamma[H + (3 lambda_s sigma / (mu0 M_s^2)) M], sigma = -stiffness (y + inertia y''/w0^2)"
     source = "D. C. Jiles, J. Phys. D 28 (1995) 1537: stress field (3 sigma / (2 mu0)) d lambda / dM"
     signature = "the loop deforms where y is large, and through the resonance with frequency"
     amplitude = "stiffness"
@@ -39,9 +51,10 @@ class StressFeedback(AbstractEffect):
 
     def field_shift(self, trial, state, actuator):
         """H less the relays' field, A/m."""
-        rod = actuator.magnetostriction
-        y = self._move(trial, state, actuator)[0]
-        return self.stiffness * y * 3 * rod.lambda_s / (MU0 * rod.M_s**2) * trial.magnetization
+        rod, mechanics = actuator.magnetostriction, actuator.mechanics
+        y, rate, free = self._move(trial, state, actuator)
+        pushed = free - y - mechanics.xi * rate / (jnp.pi * mechanics.f0)  # y''/w0^2
+        return self.stiffness * (y + self.inertia * pushed) * 3 * rod.lambda_s / (MU0 * rod.M_s**2) * trial.magnetization
 
     def advance(self, trial, state, actuator):
         """The rod after the step."""
