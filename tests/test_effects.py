@@ -85,14 +85,14 @@ def test_a_limited_voltage_bounds_the_current(linkage):
     command, limit = np.asarray(CURRENT), 0.6
     effect = effects.AmplifierClipping(inverse_limit=1 / limit, tau_L=2e-3, linkage=linkage)
     act = actuator(20).with_effect(effect)
-    found = run_chain(act, CURRENT, DT, 4, 4)
+    found = run_chain(act, CURRENT, DT, 8, 4)
     current, B = np.asarray(found.current), np.asarray(found.flux_density)
     voltage = current + 2e-3 * (current - np.roll(current, 1)) / DT + linkage * (B - np.roll(B, 1)) / DT
     assert np.abs(voltage).max() == pytest.approx(limit, rel=1e-5) and np.abs(command).max() > 0.65
     free = np.abs(voltage) < limit * (1 - 1e-4)
     assert 0.05 < free.mean() < 0.95 and np.abs(current - command)[free].max() < 1e-12
     # the field is that of this current: without the effect, driven by it
-    alone = run_chain(dataclasses.replace(act, effects=()), found.current, DT, 4, 4)
+    alone = run_chain(dataclasses.replace(act, effects=()), found.current, DT, 8, 4)
     assert np.abs(np.asarray(found.field - alone.field)).max() < 1e-6 * np.ptp(np.asarray(alone.field))
     other = run_chain(act.replace({"effects.amplifier_clipping.linkage": 0.0}), CURRENT, DT, 4, 4).current
     assert (linkage > 0) == (np.abs(current - np.asarray(other)).max() > 1e-3)
