@@ -7,7 +7,6 @@ effects). What an effect that is asked for does at its own block depends on none
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from magjax.chain import Timeline
 from magjax.chain.coupled import disturbance_of, magnetize
 from magjax.effects.base import AbstractEffect
+from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain
 
 AT_ONCE = 8  # columns pushed through a map side by side
@@ -45,7 +45,7 @@ def _march(predictor, actuator, drive, dt, added=None, change=None):
     return last, (v, M, whole[1])
 
 
-@eqx.filter_jit
+@kept
 def trajectory(predictor, actuator):
     """The march of every recording, per grid: (field, magnetization) of the last period, (recordings, samples), and (relay field,
     magnetization, coil current, step) of all periods, (recordings, time)."""
@@ -58,7 +58,7 @@ def trajectory(predictor, actuator):
     return [row[0] for row in rows], [row[1] for row in rows]
 
 
-@eqx.filter_jit
+@kept
 def in_step_change(effect, predictor, actuator, path, finite: bool):
     """What an effect adds to every step along a `trajectory`, 3 of (recordings, time) per grid: its derivative at null, or, `finite`,
     all of it."""
@@ -74,7 +74,7 @@ def in_step_change(effect, predictor, actuator, path, finite: bool):
     return tuple(jax.vmap(one)(*part) for part in path)
 
 
-@eqx.filter_jit
+@kept
 def drive_change(effect, predictor, actuator):
     """d drive / d amplitude of a source effect at null, per grid, (recordings, samples)."""
 
@@ -85,7 +85,7 @@ def drive_change(effect, predictor, actuator):
     return tuple(jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True))
 
 
-@eqx.filter_jit
+@kept
 def through_march(predictor, actuator, added, changes):
     """First-order change of field, magnetization and current, per grid, (columns, recordings, samples) each.
 
@@ -102,7 +102,7 @@ def through_march(predictor, actuator, added, changes):
     return jax.lax.map(lambda d: push(*d), (added, changes), batch_size=AT_ONCE)
 
 
-@eqx.filter_jit
+@kept
 def signals_of(predictor, actuator, fields):
     """Every signal of the last period of every recording from its `fields`, per grid: `Signals` of (recordings, samples)."""
 
@@ -119,7 +119,7 @@ def lines_of(predictor, signals) -> np.ndarray:
     return np.concatenate(rows)[np.asarray(predictor.index)]
 
 
-@eqx.filter_jit
+@kept
 def late_change(effects, predictor, actuator, signals):
     """d (free displacement, displacement, reading) / d amplitude of an effect behind the hysteresis at null, where it acts, per grid,
     (shapes, recordings, samples) each. `effects`: one with its shapes stacked; `signals`: of `signals_of`."""
@@ -166,7 +166,7 @@ class _Added(AbstractEffect):
         return reading + self.read
 
 
-@eqx.filter_jit
+@kept
 def to_lines(predictor, actuator, fields, changes, late):
     """First-order change of the reading's lines by changes of signals, (columns, recordings, harmonics + 1).
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from magjax.errors import MagjaxError
+from magjax.programs import kept
 from magjax.terms import DRIVE_UNITS
 
 from .model import Predictor, whitened
@@ -128,7 +129,7 @@ def separations(trials, drives, spectra):
     return np.array(columns).T
 
 
-@eqx.filter_jit
+@kept
 def _lines_and_slopes(layout, z, target, template, predictor):
     def lines(y):
         return whitened(predictor(layout.actuator(template, y)), target)

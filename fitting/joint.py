@@ -15,6 +15,8 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import structural_rank
 
+from magjax.programs import kept
+
 from .model import Layout, Predictor, Target, whitened
 from .solver import damped_step, pushed
 
@@ -86,24 +88,24 @@ class Solution:
     interrupted: bool = False
 
 
-@eqx.filter_jit
+@kept
 def _march(layout, z, template, predictor):
     return predictor.march(layout.actuator(template, z), layout.levels(z))
 
 
-@eqx.filter_jit
+@kept
 def _march_tangents(layout, z, template, predictor):
     """Fields and magnetizations, and their change with each unknown, (unknowns, recordings, samples) per grid."""
     marched, push = jax.linearize(lambda y: predictor.march(layout.actuator(template, y), layout.levels(y)), z)
     return marched, pushed(push, jnp.eye(z.shape[0]))
 
 
-@eqx.filter_jit
+@kept
 def _read_residual(layout, z, target, template, predictor, marched):
     return whitened(predictor.lines(layout.actuator(template, z), marched), target)
 
 
-@eqx.filter_jit
+@kept
 def _read_jacobian(layout, z, target, template, predictor, marched, tangents, place):
     """The Jacobian from the tangents of the march, those of unknowns `place`; the others do not move it."""
     n = z.shape[0]
@@ -120,7 +122,7 @@ def data_residual(problem: Problem, z):
     return np.asarray(_read_residual(problem.layout, jnp.asarray(z), problem.target, problem.template, predictor, marched))
 
 
-@eqx.filter_jit
+@kept
 def _read_residuals(layout, z, lines, target, template, predictor):
     actuators, levels = jax.vmap(lambda y: (layout.actuator(template, y), layout.levels(y)))(z)
     found = predictor.lines_of_each(actuators, levels)

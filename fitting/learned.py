@@ -6,12 +6,12 @@ The one that foretells recordings left out one at a time best is kept, if it doe
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from magjax.effects.learned_term import OUTPUTS, UNITS, LearnedTerm
+from magjax.programs import kept
 from magjax.simulate import run_chain
 
 from .check import check_errors
@@ -184,7 +184,7 @@ def band(learned: Learned, *values):
     return value.reshape(shape), size * np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
 
 
-@eqx.filter_jit
+@kept
 def _sensitivities(actuator, drive, dt, periods, corners):
     """Reading, its derivative in every coefficient and in every end's slope, (coefficients + ends, time)."""
     term = actuator.effect("learned_term")

@@ -14,6 +14,7 @@ import numpy as np
 
 from magjax.chain import Timeline
 from magjax.preisach import Preisach
+from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
 from .density import DensityBasis
@@ -229,7 +230,7 @@ class Predictor(eqx.Module):
         return jnp.concatenate(parts)[np.asarray(self.index)]
 
 
-@eqx.filter_jit
+@kept
 def predicted_lines(predictor: Predictor, actuator):
     """`predictor(actuator)` compiled: (recordings, harmonics + 1), complex."""
     return predictor(actuator)

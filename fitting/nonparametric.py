@@ -16,6 +16,7 @@ import numpy as np
 from magjax.chain import Timeline
 from magjax.constants import MU0
 from magjax.effects.learned_term import PAD, LearnedTerm
+from magjax.programs import kept
 from magjax.simulate import run_chain
 
 from .columns import marching, through_march, to_lines, trajectory
@@ -59,7 +60,7 @@ class Place:
     term: LearnedTerm = dataclasses.field(repr=False)
 
 
-@eqx.filter_jit
+@kept
 def _signals(predictor, actuator):
     """Every signal of the last period of every recording with its rates, grid by grid."""
 
@@ -116,7 +117,7 @@ def null_term(block, variables, signals, actuator, counts) -> LearnedTerm:
     return LearnedTerm.null(block, variables, ends[:, 0], ends[:, 1], counts, np.ones(int(np.prod(counts))), size, knee)
 
 
-@eqx.filter_jit
+@kept
 def _moved(predictor, actuator, force):
     """Displacement by a force behind the hysteresis, given as the static displacement, m, (columns, recordings, samples) per grid."""
 

@@ -6,12 +6,12 @@ xi for each frequency. The R_eddy under which these xi vary least is taken, and 
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from magjax.errors import ConfigurationError
+from magjax.programs import kept
 from magjax.simulate import run_chain
 
 from .spectra import reduce_recording
@@ -57,7 +57,7 @@ def recipe_beside(result, recordings) -> LagTable:
     return lag_recipe(tones, result.actuator, float(result.actuator.coil.R_eddy) * MESH)
 
 
-@eqx.filter_jit
+@kept
 def _square_lags(actuator, drives, steps, resistances):
     """Phase of the fundamental of M^2 against the drive's, rad: (resistances, recordings)."""
 

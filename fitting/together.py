@@ -12,6 +12,8 @@ import threading
 
 import jax
 
+from magjax.programs import forget
+
 SIDE_BY_SIDE = 2
 
 
@@ -88,6 +90,7 @@ class _Turns:
 
 def let_go() -> None:
     """Give back the memory of compiled programs that are not needed again: some hundred megabytes each."""
+    forget()
     jax.clear_caches()
     gc.collect()
     if sys.platform == "linux":

@@ -17,6 +17,7 @@ from .chain.coupled import magnetize, march_of, period_change, run_until_steady
 from .constants import MU0
 from .errors import ConfigurationError
 from .extrema import nesting
+from .programs import kept
 from .scale import Chunk, Job, run_job
 from .scale.devices import over_devices
 
@@ -127,7 +128,7 @@ def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, 
     return Signals(line.time, command, current, H, M, B, free, displacement, reading, v, residual, overflow, unsettled)
 
 
-_run = eqx.filter_jit(run_chain)
+_run = kept(run_chain)
 
 
 def simulate(

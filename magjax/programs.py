@@ -1,0 +1,157 @@
+"""Programs that outlive the process: traced once, kept beside the compiler's cache, read and not traced again.
+
+Tracing a fit's program in Python takes longer than to read it compiled and to run it, and a diagnosis asks for some hundred. A program is
+known by its function, the structure, shapes and constants of its arguments, and the versions of jax and of this project's files; one
+that holds a class from elsewhere (an effect in a notebook, which may change under its name) is not kept. Without a folder
+(`jax_compilation_cache_dir`) everything is as `equinox.filter_jit` has it.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib
+import importlib.util
+import json
+import os
+import threading
+import zlib
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jaxlib
+import numpy as np
+from jax import export
+
+MOST = 300_000_000  # bytes on disk; beyond, those that were used longest ago go
+OWN = ("magjax", "fitting")
+IN_MEMORY: list[dict] = []  # the programs of every function
+
+
+def kept(function):
+    """As `equinox.filter_jit`, for a function of modules, arrays and constants that returns arrays in tuples, lists, dicts and modules."""
+    plain, known = eqx.filter_jit(function), {}
+    IN_MEMORY.append(known)
+
+    @functools.wraps(function)
+    def call(*arguments):
+        folder = jax.config.jax_compilation_cache_dir
+        arrays, constants = eqx.partition(arguments, lambda x: isinstance(x, jax.Array | np.ndarray))
+        leaves, tree = jax.tree.flatten(arrays)
+        if not folder or any(isinstance(x, jax.core.Tracer) for x in leaves):
+            return plain(*arguments)
+        values, other = jax.tree.flatten(constants)
+        key = (tree, other, tuple(values), tuple((x.shape, str(x.dtype)) for x in leaves))
+        if key not in known:
+            known[key] = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
+        return known[key](leaves) if known[key] else plain(*arguments)
+
+    return call
+
+
+def forget() -> None:
+    """Drop all programs from memory; they are read again where they are asked for."""
+    for known in IN_MEMORY:
+        known.clear()
+
+
+def _program(function, arguments, constants, key, leaves, folder):
+    """The program as a function of the leaves, read or traced; None where it cannot be kept."""
+    modules = set()
+    jax.tree.flatten(arguments, is_leaf=lambda x: isinstance(x, eqx.Module) and modules.add(_home(type(x))))
+    said = f"{function.__module__}.{function.__qualname__} {key} {jax.default_backend()} {jax.config.jax_enable_x64} {_versions()}"
+    if not modules <= set(OWN) or " at 0x" in said:
+        return None
+    path = folder / f"{hashlib.sha256(said.encode()).hexdigest()}.program"
+    try:
+        form, exported = _read(path)
+    except Exception:  # not there, cut short, of another make
+        try:
+            form, exported = _traced(function, constants, key[0], leaves)
+            lasting = zlib.compress(json.dumps(form).encode() + b"\n" + bytes(exported.serialize()), 1)
+        except Exception:  # something in it has no lasting form
+            return None
+        _write(path, lasting)
+    run = jax.jit(exported.call)
+    return lambda leaves: _filled(form, jax.tree.leaves(run(*leaves)))
+
+
+def _traced(function, constants, tree, leaves):
+    """The form of what it returns, and the program."""
+
+    def flat(*leaves):
+        return function(*eqx.combine(jax.tree.unflatten(tree, leaves), constants))
+
+    exported = export.export(jax.jit(flat))(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves))
+    return _form(jax.tree.unflatten(exported.out_tree, range(exported.out_tree.num_leaves))), exported
+
+
+def _form(tree):
+    """The structure in JSON, numbers for arrays; `TypeError` for what has none."""
+    if tree is None or isinstance(tree, int):
+        return tree
+    if type(tree) in (tuple, list):
+        return [type(tree).__name__, *map(_form, tree)]
+    if type(tree) is dict and all(isinstance(k, str) for k in tree):
+        return {"": None, **{k: _form(v) for k, v in tree.items()}}
+    if isinstance(tree, eqx.Module) and _home(type(tree)) in OWN:
+        fields = {f.name: _form(getattr(tree, f.name)) for f in dataclasses.fields(tree)}
+        return {"": f"{type(tree).__module__}:{type(tree).__qualname__}", **fields}
+    raise TypeError(f"a kept program cannot return {type(tree).__name__}")
+
+
+def _filled(form, values):
+    """The `_form` with the program's values."""
+    if form is None or isinstance(form, int):
+        return None if form is None else values[form]
+    if isinstance(form, list):
+        return (tuple if form[0] == "tuple" else list)(_filled(f, values) for f in form[1:])
+    fields = {k: _filled(f, values) for k, f in form.items() if k}
+    if form[""] is None:
+        return fields
+    module, name = form[""].split(":")
+    return getattr(importlib.import_module(module), name)(**fields)
+
+
+def _home(kind) -> str:
+    """The package that a class comes from."""
+    return kind.__module__.split(".")[0]
+
+
+def _read(path):
+    form, program = zlib.decompress(path.read_bytes()).split(b"\n", 1)
+    os.utime(path)
+    return json.loads(form), export.deserialize(bytearray(program))
+
+
+def _write(path, content: bytes) -> None:
+    """Whole or not at all; without a word where there is no room: the next process traces anew."""
+    partial = path.with_suffix(f".{os.getpid()}.{threading.get_ident()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(content)
+        partial.replace(path)
+        _make_room(path.parent)
+    except OSError:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+
+
+def _make_room(folder) -> None:
+    there = sorted((f.stat().st_mtime, f.stat().st_size, f) for f in folder.glob("*.program"))
+    over = sum(size for _, size, _ in there) - MOST
+    for _, size, path in there:
+        if over <= 0:
+            break
+        path.unlink(missing_ok=True)
+        over -= size
+
+
+@functools.cache
+def _versions() -> str:
+    """Of jax and equinox, and of every file of this project."""
+    roots = [Path(importlib.util.find_spec(name).origin).parent for name in OWN]
+    files = [f for root in roots for f in sorted(root.rglob("*.py"))]
+    source = hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
+    return f"{jax.__version__} {jaxlib.__version__} {eqx.__version__} {source}"

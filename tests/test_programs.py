@@ -1,0 +1,97 @@
+"""Programs kept between processes: read where nothing has changed, traced where anything has."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import magjax.programs as programs
+from magjax.bench import load_bench
+from magjax.chain import Timeline
+from magjax.programs import forget, kept
+from magjax.simulate import Signals, run_chain
+
+TRACED = []
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path):
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    TRACED.clear()
+    yield tmp_path / "programs"
+    jax.config.update("jax_compilation_cache_dir", before)
+    forget()
+
+
+@kept
+def scaled(line, values, factor, more=None):
+    TRACED.append(factor)
+    return [values * factor * line.dt, (line.time, None)], {"more": line.dt if more is None else more}
+
+
+def test_a_program_is_read_and_not_traced_again(folder):
+    line, values = Timeline(jnp.asarray(0.5), 6, True), jnp.arange(6.0)
+    first = scaled(line, values, 2.0)
+    assert TRACED == [2.0] and len(list(folder.iterdir())) == 1
+    for _ in range(2):
+        forget()  # as another process
+        again = scaled(line, np.arange(6.0) + 1, 2.0)
+    assert TRACED == [2.0] and np.allclose(again[0][0], np.arange(6) + 1.0)
+    assert jax.tree.structure(first) == jax.tree.structure(again) and again[0][1][1] is None and float(again[1]["more"]) == 0.5
+    # what a trace depends on makes another: a constant, a shape, what a module holds fast, its structure
+    scaled(line, values, 3.0), scaled(line, jnp.ones((2, 6)), 2.0), scaled(Timeline(jnp.asarray(0.5), 7, True), values, 2.0)
+    scaled(Timeline(jnp.asarray(0.5), 6, False), values, 2.0), scaled(line, values, 2.0, values)
+    assert len(TRACED) == 6 == len(list(folder.iterdir()))
+
+
+def test_it_gives_what_the_traced_one_gives(folder):
+    act, drive = load_bench("aa-050h").actuator(), jnp.asarray(0.5 * np.sin(2 * np.pi * np.arange(60) / 60))
+    run, plain = kept(run_chain), eqx.filter_jit(run_chain)
+    run(act, drive, 1e-4, 2, 4)
+    forget()
+    found, expected = run(act, drive, 1e-4, 2, 4), plain(act, drive, 1e-4, 2, 4)
+    assert isinstance(found, Signals) and jax.tree.structure(found) == jax.tree.structure(expected)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True))
+    slope = jax.jvp(lambda x: run(act, x, 1e-4, 2, 4).reading, (drive,), (drive,))[
+        1
+    ]  # inside another trace it is a function as any
+    assert np.isfinite(np.asarray(slope)).all()
+
+
+def test_files_that_changed_and_programs_that_were_spoiled_are_made_anew(folder, monkeypatch):
+    line, values = Timeline(jnp.asarray(0.5), 6, True), jnp.arange(6.0)
+    scaled(line, values, 2.0)
+    (path,) = folder.iterdir()
+    path.write_bytes(path.read_bytes()[:100])
+    forget()
+    assert np.allclose(scaled(line, values, 2.0)[0][0], np.arange(6)) and len(TRACED) == 2
+    monkeypatch.setattr(programs, "_versions", lambda: "another source")
+    forget()
+    scaled(line, values, 2.0)
+    assert len(TRACED) == 3 and len(list(folder.iterdir())) == 2
+
+
+def test_classes_from_elsewhere_are_not_kept(folder):
+    """An effect in a notebook may change under its name."""
+
+    class Mine(eqx.Module):
+        dt: jax.Array
+        time: float = 0.0
+
+    for _ in range(2):
+        forget()
+        scaled(Mine(jnp.asarray(1.0)), jnp.arange(3.0), 2.0)
+    assert not folder.exists() and TRACED == [2.0]  # the usual program of this process
+
+
+def test_nothing_is_kept_without_a_folder_or_without_room(folder, monkeypatch):
+    line, values = Timeline(jnp.asarray(0.5), 6, True), jnp.arange(6.0)
+    monkeypatch.setattr(programs, "MOST", 1)
+    assert np.allclose(scaled(line, values, 5.0)[0][0], 2.5 * np.arange(6)) and not list(folder.iterdir())
+    folder.rmdir()
+    folder.write_text("in the way")
+    assert np.allclose(scaled(line, values, 6.0)[0][0], 3.0 * np.arange(6))
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert np.allclose(scaled(line, values, 7.0)[0][0], 3.5 * np.arange(6)) and TRACED == [5.0, 6.0, 7.0]
