@@ -134,9 +134,10 @@ def _says_more(again, found) -> bool:
     return number > before or (number == before and len(again.groups) < len(found.groups))
 
 
-def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
+def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zeros: bool = True) -> Diagnosis:
     """The diagnosis of recordings without the record-level effects `adopted`; `measured`: the task with them as they came,
-    `plain`: a fit of theirs, where it is known."""
+    `plain`: a fit of theirs, where it is known; `before_zeros`: task and adopted before zeros of the recordings were; `zeros`:
+    whether these may be."""
     plain = task.fit() if plain is None else plain
     if problem := wrong_bench(plain):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
@@ -145,9 +146,9 @@ def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
         cleaned, hum, freed = found
         return _examined(cleaned, measured, [*adopted, hum], check, freed)
     plain, candidates, zero, rival = _sensor_zero(task, plain, candidates)
-    if zero is None and (found := _own_zeros(task, adopted, plain, candidates)):
-        cleaned, zeros, freed = found
-        return _examined(cleaned, measured, [*adopted, zeros], check, freed)
+    if zeros and zero is None and (found := _own_zeros(task, adopted, plain, candidates)):
+        cleaned, own, freed = found
+        return _examined(cleaned, measured, [*adopted, own], check, freed, (task, adopted))
     free = task.held if zero is None else (*task.held, "sensor.offset")
     raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
     checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
@@ -158,14 +159,16 @@ def _examined(task, measured, adopted, check, plain=None) -> Diagnosis:
     def begins_anew(current) -> bool:
         if found := _hum_on_harmonics(task, adopted, current):
             cleaned, hum, _ = found
-            anew.append((cleaned, measured, [*adopted, hum], check))
+            anew.append({"task": cleaned, "adopted": [*adopted, hum]})
         elif zero is None and (better := _better_valley(task, plain, candidates, current)):
-            anew.append((task, measured, adopted, check, better))
+            anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
         return bool(anew)
 
     reached = search(task, plain, candidates, checks[1], begins_anew)
     if anew:
-        return _examined(*anew[-1])
+        return _examined(measured=measured, check=check, zeros=zeros, **anew[-1])
+    if before_zeros and _needless_zeros(before_zeros[0], reached):
+        return _examined(before_zeros[0], measured, before_zeros[1], check, zeros=False)
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried),
@@ -294,6 +297,19 @@ def _own_zeros(task, adopted, base, candidates):
     if any(t.physical and chi2_of(t.result) + t.parameters * np.log(freed.data_count) < cost for t in trials):
         return None
     return cleaned, (effect, rivals), freed
+
+
+def _needless_zeros(task, reached) -> bool:
+    """Whether the recordings with their means are met as well by the effects that were found beside zeros of their own.
+
+    `task`: before the means were set free."""
+    if not reached.steps:
+        return False
+    current = reached.current
+    task.say("with the means again", current.chi2_per_sample)
+    again = task.fit(current.actuator, start=current, choices=current.choices, refine=False)
+    means = again.data_count - current.data_count
+    return chi2_of(again) < chi2_of(current) + max(MIN_DROP, 2 * means)
 
 
 def _sensor_zero(task, base, candidates):

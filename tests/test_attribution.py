@@ -434,3 +434,19 @@ def test_a_law_whose_first_order_misleads_is_fitted_from_elsewhere_too(ends, fit
 
     found = fitting.attribute.settled(Told((), None), base, first, 29.0 * COUNT)
     assert begun == [(False, -0.2), (True, 0.6)][:fits] and found.result.chi2_per_sample == 1.0
+
+
+def test_zeros_of_the_recordings_are_dropped_where_an_effect_meets_the_means_too():
+    """A fit in a valley may have asked for them before the effect was found."""
+    from fitting.diagnose import _needless_zeros
+
+    current = SimpleNamespace(chi2_per_sample=1.0, data_count=COUNT - 10, actuator=None, spectra=(), choices=Choices())
+
+    class Told(Task):
+        def fit(self, actuator=None, **more):
+            assert more["start"] is current and not more["refine"]
+            return SimpleNamespace(chi2_per_sample=self.recordings[0], data_count=COUNT)
+
+    found = Reached(current, [("an effect",)], {})
+    assert _needless_zeros(Told((1.01,), None), found) and not _needless_zeros(Told((1.1,), None), found)
+    assert not _needless_zeros(Told((1.01,), None), Reached(current, [], {}))  # the zeros are all there is
