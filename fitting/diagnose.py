@@ -11,7 +11,7 @@ import numpy as np
 from magjax.bench import load_bench
 
 from .alternation import alternating
-from .attribute import MIN_DROP, MISFIT, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
+from .attribute import MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
 from .fit import FINER_FROM, REFINE_BELOW, finer_than
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
@@ -300,7 +300,7 @@ def _own_zeros(task, adopted, base, candidates):
 
 
 def _needless_zeros(task, reached) -> bool:
-    """Whether the recordings with their means are met as well by the effects that were found beside zeros of their own.
+    """Whether the recordings with their means are met by the effects that were found beside zeros of their own, nearly as well.
 
     `task`: before the means were set free."""
     if not reached.steps:
@@ -308,8 +308,8 @@ def _needless_zeros(task, reached) -> bool:
     current = reached.current
     task.say("with the means again", current.chi2_per_sample)
     again = task.fit(current.actuator, start=current, choices=current.choices, refine=False)
-    means = again.data_count - current.data_count
-    return chi2_of(again) < chi2_of(current) + max(MIN_DROP, 2 * means)
+    cost = 2 * len(task.recordings) * np.log(again.data_count)
+    return again.chi2_per_sample < SETTLED_CHI2 and chi2_of(again) < chi2_of(current) + cost
 
 
 def _sensor_zero(task, base, candidates):

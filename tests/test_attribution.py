@@ -448,5 +448,7 @@ def test_zeros_of_the_recordings_are_dropped_where_an_effect_meets_the_means_too
             return SimpleNamespace(chi2_per_sample=self.recordings[0], data_count=COUNT)
 
     found = Reached(current, [("an effect",)], {})
-    assert _needless_zeros(Told((1.01,), None), found) and not _needless_zeros(Told((1.1,), None), found)
-    assert not _needless_zeros(Told((1.01,), None), Reached(current, [], {}))  # the zeros are all there is
+    ten = (0.0,) * 9
+    assert _needless_zeros(Told((1.1, *ten), None), found) and not _needless_zeros(Told((1.2, *ten), None), found)
+    assert not _needless_zeros(Told((1.1,), None), found)  # one zero that takes as much
+    assert not _needless_zeros(Told((1.01, *ten), None), Reached(current, [], {}))  # the zeros are all there is
