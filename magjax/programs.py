@@ -22,7 +22,6 @@ import equinox as eqx
 import jax
 import jaxlib
 import numpy as np
-from jax import export
 
 MOST = 300_000_000  # bytes on disk; beyond, those that were used longest ago go
 OWN = ("magjax", "fitting")
@@ -79,6 +78,7 @@ def _program(function, arguments, constants, key, leaves, folder):
 
 def _traced(function, constants, tree, leaves):
     """The form of what it returns, and the program."""
+    from jax import export  # an old jax asks for a package here that it does not install
 
     def flat(*leaves):
         return function(*eqx.combine(jax.tree.unflatten(tree, leaves), constants))
@@ -120,6 +120,8 @@ def _home(kind) -> str:
 
 
 def _read(path):
+    from jax import export
+
     form, program = zlib.decompress(path.read_bytes()).split(b"\n", 1)
     os.utime(path)
     return json.loads(form), export.deserialize(bytearray(program))

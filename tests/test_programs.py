@@ -12,6 +12,12 @@ from magjax.chain import Timeline
 from magjax.programs import forget, kept
 from magjax.simulate import Signals, run_chain
 
+pytest.importorskip("flatbuffers")
+try:
+    from jax import export  # noqa: F401
+except ImportError as error:
+    pytest.skip(f"this jax keeps no programs: {error}", allow_module_level=True)
+
 TRACED = []
 
 
