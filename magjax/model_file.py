@@ -46,7 +46,8 @@ def _model(content):
         actuator = actuator.with_effect(effect)
     stated = content["parameters"]
     known = actuator.parameters()
-    if missing := [name for name, (_, info) in known.items() if name not in stated and info.null is None]:
+    # shapes have a default, which leaves a law as it was before it had them
+    if missing := [n for n, (_, info) in known.items() if n not in stated and info.null is None and not info.shape]:
         raise ConfigurationError(f"parameters lacks {', '.join(missing)}")
     masses = np.asarray(plane["masses"], float)
     numbers = {**stated, **{f"hysteresis.{k}": plane[k] for k in ("low", "high", "offset")}, "hysteresis.masses": masses.sum()}

@@ -42,9 +42,10 @@ def kept(function):
             return plain(*arguments)
         values, other = jax.tree.flatten(constants)
         key = (tree, other, tuple(values), tuple((x.shape, str(x.dtype)) for x in leaves))
-        if key not in known:
-            known[key] = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
-        return known[key](leaves) if known[key] else plain(*arguments)
+        program = known.get(key)  # another thread may `forget` it
+        if program is None:
+            program = known[key] = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
+        return program(leaves) if program else plain(*arguments)
 
     return call
 
@@ -56,12 +57,12 @@ def forget() -> None:
 
 
 def _program(function, arguments, constants, key, leaves, folder):
-    """The program as a function of the leaves, read or traced; None where it cannot be kept."""
+    """The program as a function of the leaves, read or traced; False where it cannot be kept."""
     modules = set()
     jax.tree.flatten(arguments, is_leaf=lambda x: isinstance(x, eqx.Module) and modules.add(_home(type(x))))
     said = f"{function.__module__}.{function.__qualname__} {key} {jax.default_backend()} {jax.config.jax_enable_x64} {_versions()}"
     if not modules <= set(OWN) or " at 0x" in said:
-        return None
+        return False
     path = folder / f"{hashlib.sha256(said.encode()).hexdigest()}.program"
     try:
         form, exported = _read(path)
@@ -70,7 +71,7 @@ def _program(function, arguments, constants, key, leaves, folder):
             form, exported = _traced(function, constants, key[0], leaves)
             lasting = zlib.compress(json.dumps(form).encode() + b"\n" + bytes(exported.serialize()), 1)
         except Exception:  # something in it has no lasting form
-            return None
+            return False
         _write(path, lasting)
     run = jax.jit(exported.call)
     return lambda leaves: _filled(form, jax.tree.leaves(run(*leaves)))

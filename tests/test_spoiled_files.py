@@ -136,6 +136,19 @@ def test_a_header_that_contradicts_by_a_thousand_tells_the_unit_of_the_time(tmp_
     )
 
 
+def test_a_model_from_before_a_law_had_a_detail_is_read(tmp_path):
+    from fitting.result import write_model
+    from magjax.effects import StressFeedback
+
+    bench = load_bench("aa-050h")
+    write_model(tmp_path, bench.actuator().with_effect(StressFeedback(stiffness=1e10, inertia=3.0)), bench)
+    content = json.loads((tmp_path / "model.json").read_text())
+    assert content["parameters"].pop("effects.stress_feedback.inertia") == 3.0
+    (tmp_path / "model.json").write_text(json.dumps(content))
+    effect = load_model(tmp_path)[0].effect("stress_feedback")
+    assert float(effect.stiffness) == 1e10 and float(effect.inertia) == 0.0
+
+
 @pytest.mark.parametrize(("change", "why"), [
     (lambda m: m["parameters"].update({"coil.R_eddy": float("nan")}), "coil.R_eddy is not a finite number"),
     (lambda m: m["parameters"].update({"coil.R_eddy": -5.0}), "coil.R_eddy = -5 is outside"),
