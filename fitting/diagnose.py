@@ -46,10 +46,8 @@ ABSORBED_VISIBILITY = 0.004
 LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
-UNPROMISED, VALLEY = (
-    3.0,
-    0.3,
-)  # times what any effect promised, that effects take where the plain fit is tried from there; its share of it
+UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
+VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
