@@ -18,6 +18,11 @@ SPELLED = {
     "sec": "s", "millisecond": "ms", "milliseconds": "ms", "micrometre": "um", "micrometer": "um", "micron": "um", "millimetre": "mm",
     "millimeter": "mm", "tesla": "T", "volt": "V", "volts": "V",
 }  # fmt: skip
+USUAL = {
+    "current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm", "time": "time_s",
+    "reference": "reference_m", "voltage": "voltage_V", "polarization": "polarization_C_per_m2", "flux_density": "flux_density_T",
+    "magnetization": "magnetization_A_per_m", "command": "command_A", "temperature": "temperature_degC", "stress": "stress_MPa",
+}  # fmt: skip
 TEXT = (".csv", ".txt", ".dat", ".tsv", "")  # read as CSV
 
 
@@ -245,6 +250,7 @@ def _parse(name):
 def _recordings(path, table, origin, bench) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
     columns, units, available = {}, {}, list(table)
+    _refuse_missing(path, table, bench)
     for quantity in (
         "time",
         "voltage",
@@ -284,6 +290,17 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
     return [_one(name, {q: v[rows] for q, v in columns.items()}, units, origin, bench) for name, rows in parts]
 
 
+def _refuse_missing(path, table, bench):
+    """Where several columns are missing, one line names them all (of a single one, `_find` tells how to name it)."""
+    wanted = (*(() if bench.columns.get("time", {}).get("quasistatic") else ("time",)), bench.drive, bench.output)
+    missing = [q for q in dict.fromkeys(wanted) if _column(table, q, bench.columns.get(q, {}))[0] is None]
+    if len(missing) > 1:
+        usual = ", ".join(bench.columns.get(q, {}).get("name", USUAL[q]) for q in missing)
+        raise RecordingError(
+            f"{path}: no columns for {', '.join(missing)} among {', '.join(table)}; name them {usual} or map them in [columns] of the bench"
+        )
+
+
 def _refuse_clipping(name, columns, bench):
     """Clipping is seen in what the converter read: before gaps are filled, captures joined or an emf is integrated."""
     for quantity, values in columns.items():
@@ -311,12 +328,9 @@ def _find(path, table, quantity, column, required):
             return None
         if "name" in column:
             raise RecordingError(f"{path}: no column {column['name']}; the file has {', '.join(table)} (see [columns.{quantity}])")
-        usual = {
-            "current": "current_A", "displacement": "displacement_m", "field": "field_A_per_m", "strain": "strain_ppm", "time": "time_s",
-            "reference": "reference_m", "voltage": "voltage_V", "polarization": "polarization_C_per_m2",
-        }.get(quantity, "flux_density_T")  # fmt: skip
         raise RecordingError(
-            f"{path}: no {quantity} column among {', '.join(table)}; name it {usual} or map it in [columns.{quantity}] of the bench"
+            f"{path}: no {quantity} column among {', '.join(table)}; "
+            f"name it {USUAL[quantity]} or map it in [columns.{quantity}] of the bench"
         )
     values, factor = np.asarray(table[name], float), 1.0
     if unit is not None and "emf_turns" not in column:

@@ -5,6 +5,7 @@ judged: a small loop, or one at a high frequency, settles over tens of periods w
 """
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -44,6 +45,7 @@ class Signals(eqx.Module):
     unsettled: Array
 
 
+MOST_SWEPT = 10_000_000  # steady states of a sweep, or kept samples: 0.6 GB of results
 MOST_PERIODS = 250  # a drive that has not settled by then is told as it is
 TOLERANCE = 1e-8  # of a single steady state; a sweep asks for less
 
@@ -227,8 +229,12 @@ def sweep(
             raise ConfigurationError(
                 f"{name}: {found}; give {'numbers above zero, Hz' if name == 'frequencies' else 'finite numbers'}"
             )
-    grid = [x.ravel() for x in np.meshgrid(*axes, indexing="ij")]
     shape = tuple(len(x) for x in axes)
+    values, most = math.prod(shape) * (samples if keep else 1), MOST_SWEPT
+    if values > most:
+        what = f"{values:,} kept samples" if keep else f"{values:,} steady states"
+        raise ConfigurationError(f"{what} in one sweep, at most {most:,} fit; sweep parts of the grid, each to its own file")
+    grid = [x.ravel() for x in np.meshgrid(*axes, indexing="ij")]
     start = actuator.hysteresis.history.shape[0] // 2
     corners = int(4 * np.ceil((4 + start) / 4))
     total = len(grid[0])

@@ -56,6 +56,8 @@ def test_decimal_commas_are_read(tmp_path, separator):
     (rows(columns=(np.where(np.arange(len(TIME)) == 7, np.nan, TIME), CURRENT, READING)), "the time of sample 7 is no number"),
     (rows(columns=(TIME, CURRENT, np.where(np.arange(len(TIME)) == 9, 1e3, READING))), "only sample 9 does: a spike"),
     (rows().encode("utf-16"), "no text in UTF-8"),
+    (rows(head="t,i,displacement_m"), "no columns for time, current among t, i, displacement_m; name them time_s, current_A or map them"),
+    (rows(head="t,current_A,displacement_m"), "no time column among t, current_A, displacement_m"),
 ])  # fmt: skip
 def test_what_cannot_be_meant_is_refused(tmp_path, text, why):
     with pytest.raises(RecordingError, match=why) as caught:
@@ -223,8 +225,10 @@ def test_numbers_that_are_none_are_null_in_json():
 
 @pytest.mark.parametrize(("options", "why"), [
     (["--cells", "100000"], "takes 120"), (["--max-jacobians", "0"], "max-jacobians"), (["--model", ""], "not a fitted model"),
+    (["--profile", "f0,colour"], '"colour" is not free in this fit; free are coil.R_eddy'),
 ])  # fmt: skip
-def test_options_that_cannot_work_are_refused_first(tmp_path, options, why, capsys):
+def test_options_that_cannot_work_are_refused_first(tmp_path, options, why, capsys, monkeypatch):
+    monkeypatch.setattr("fitting.fit.fit", lambda *_, **__: pytest.fail("the fit has begun"))
     path = tmp_path / "rec.csv"
     path.write_text(rows())
     bench = [] if "--model" in options else ["--bench", "aa-050h"]

@@ -334,5 +334,7 @@ def finish(summary, options, command) -> int:
         if "sent" in summary:
             text += f" of {summary['sent']} sent" if summary["tail_known"] else " (tail unknown)"
         text += f"; drive at zero: {summary.get('drive_at_zero', 'by its watchdog')}; {summary['path']}"
+        if "exported" in summary:
+            text += f", exported to {', '.join(summary['exported'])}"
         print(text, file=sys.stderr if status else sys.stdout)
     return status

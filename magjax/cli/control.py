@@ -50,10 +50,15 @@ def run_invert(arguments) -> int:
 
 
 def _plant(options):
+    return _plant_and_bench(options)[0]
+
+
+def _plant_and_bench(options):
     from magjax.inverse.command import load_actuator
     from magjax.inverse.dynamic import PlainActuator
 
-    return PlainActuator.from_actuator(load_actuator(options.bench, options.model))
+    actuator, bench = load_actuator(options.bench, options.model)
+    return PlainActuator.from_actuator(actuator), bench
 
 
 def _common(name, text, example):
@@ -120,7 +125,8 @@ def run_simulate(arguments) -> int:
     options = p.parse_args(arguments)
     from magjax.control.command import simulate_summary
 
-    summary = simulate_summary(_plant(options), options)
+    plant, bench = _plant_and_bench(options)
+    summary = simulate_summary(plant, options, bench.columns)
     print(json.dumps(summary) if options.json else summary["message"])
     return 0
 

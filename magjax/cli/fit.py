@@ -7,7 +7,17 @@ from pathlib import Path
 from magjax.errors import ConfigurationError, MagjaxError
 
 from .runtime import Progress, as_json, output_folder, parser, positive, prepare_jax, told
-from .scale import add_intervals, add_where, check_intervals, check_placebo, intervals, placebo_text, run_fleet, with_placebo
+from .scale import (
+    add_intervals,
+    add_where,
+    check_intervals,
+    check_placebo,
+    intervals,
+    placebo_text,
+    refuse_profile,
+    run_fleet,
+    with_placebo,
+)
 
 MOST_CELLS = 120  # a mass a cell: 7260 of them, and a normal matrix of 420 MB
 
@@ -67,7 +77,7 @@ def run_fit(arguments) -> int:
     from fitting.check import check_errors
     from fitting.fit import fit
     from fitting.reach import beyond_text
-    from fitting.setup import Choices, effect_parameters
+    from fitting.setup import Choices, effect_parameters, free_parameters
 
     choices = Choices(max_jacobians=options.max_jacobians)
     if options.cells is not None and not 2 <= options.cells <= MOST_CELLS:
@@ -77,10 +87,12 @@ def run_fit(arguments) -> int:
     if options.fleet:
         return run_fleet(options, choices, folder, Progress(options.quiet))
     bench, actuator = _bench_and_start(options)
+    extra = effect_parameters(actuator)
+    refuse_profile(options, free_parameters(bench, actuator or bench.actuator(), extra))
     recordings = load_recordings(options.recordings, bench)
     checks, refused = load_checks(options.check, bench)
     with Progress(options.quiet) as progress:
-        result = fit(recordings, bench, actuator=actuator, extra=effect_parameters(actuator), choices=choices, progress=progress)
+        result = fit(recordings, bench, actuator=actuator, extra=extra, choices=choices, progress=progress)
         (more, text), stopped = ({}, ""), None
         try:
             more, text = intervals(result, options, folder, progress)

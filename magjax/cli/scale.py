@@ -58,6 +58,14 @@ def check_intervals(options) -> None:
         raise ConfigurationError("give recordings, or --fleet with one folder an actuator; see magjax fit --help")
 
 
+def refuse_profile(options, free) -> None:
+    """Refuse a --profile of names that are not among the `free` parameters before the fit takes its time."""
+    if options.profile and options.profile != "all":
+        from fitting.scale.profile import full_names
+
+        full_names(options.profile.split(","), free)
+
+
 def intervals(result, options, folder, progress):
     """Bootstrap and profile of a fit as asked: (entries for fit.json, text)."""
     from magjax.writers import write_dataset

@@ -7,6 +7,8 @@ from magjax.errors import ConfigurationError
 from .runtime import Progress, as_json, output_folder, parser, prepare_jax, refuse_overwriting, told
 from .scale import add_where, executor_of
 
+MOST_VALUES = 1_000_000  # along one axis of a sweep
+
 
 def run(command: str, arguments: list[str]) -> int:
     """Run one of the commands of this module."""
@@ -108,6 +110,8 @@ def _values(text):
     try:
         if ":" in text:
             low, high, count = text.split(":")
+            if not 1 <= int(count) <= MOST_VALUES:
+                raise ConfigurationError(f'"{text}" asks for {count} values along one axis; give 1 to {MOST_VALUES:,}')
             return np.linspace(float(low), float(high), int(count))
         return np.asarray([float(v) for v in text.split(",")])
     except ValueError:

@@ -115,14 +115,14 @@ def design_figures(plant, options, folder) -> Path:
     return path
 
 
-def simulate_summary(plant, options) -> dict:
+def simulate_summary(plant, options, columns=None) -> dict:
     """One strategy on one trajectory, written as CSV."""
     from ..inverse.command import read_trajectory
 
     if options.trajectory in ("sine", "aperiodic"):
         time, wanted = (sinusoid if options.trajectory == "sine" else aperiodic)(plant, options.T)
     else:
-        time, wanted = read_trajectory(Path(options.trajectory))
+        time, wanted = read_trajectory(Path(options.trajectory), columns)
     run = track(plant, plant, time, wanted, options.strategy, options.u_bar)
     rms, largest = run.errors()
     out = Path(options.out)
@@ -203,7 +203,7 @@ def bounds_summary(plant, options) -> dict:
     summary["4.1"] = {"bound_A_per_m": static.value, "share_of_M_s": static.share, "note": static.note}
     lines.append(
         f"Prop. 4.1, masses off by {options.delta_I:g}: |e_M| <= {static.value:.4g} A/m "
-        f"({static.share:.3g} of the summed masses) {static.note}"
+        f"({static.share:.3g} of the summed masses){_noted(static.note)}"
     )
     for name, maker, forward in (("4.2", forward_bound, True), ("4.3", backward_bound, False)):
         try:
@@ -225,7 +225,11 @@ def bounds_summary(plant, options) -> dict:
         lines.append(
             f"Prop. {name}, T = {options.T:g} s: |e_M| <= {bound.value:.4g} A/m ({bound.share:.3g} of the summed masses) "
             f"at g_bar = {bound.g_bar:.3g}; "
-            f"simulated worst {worst:.4g} A/m ({worst / plant.operator.total:.3g} of them) {bound.note}"
+            f"simulated worst {worst:.4g} A/m ({worst / plant.operator.total:.3g} of them){_noted(bound.note)}"
         )
-    summary["message"] = "\n".join(line.rstrip() for line in lines)
+    summary["message"] = "\n".join(lines)
     return summary
+
+
+def _noted(note: str) -> str:
+    return f"; {note}" if note else ""

@@ -19,8 +19,8 @@ def invert_file(trajectory, bench, model, out, of_reading: bool = False) -> dict
     Where the wanted displacement is not feasible a third column, displacement_m, is the nearest feasible one that the
     current is for.
     """
-    actuator = load_actuator(bench, model)
-    time, wanted = read_trajectory(Path(trajectory))
+    actuator, bench = load_actuator(bench, model)
+    time, wanted = read_trajectory(Path(trajectory), bench.columns)
     h = float(np.median(np.diff(time)))
     if actuator.coil.drive == "voltage":
         return _invert_stack(actuator, trajectory, time, wanted, h, out, of_reading)
@@ -95,22 +95,26 @@ def write_table(out, columns, names: str) -> None:
 
 
 def load_actuator(bench, model):
-    """The actuator of a fitted result folder, else of a bench."""
+    """(actuator, bench) of a fitted result folder, else of a bench."""
     from ..cli.runtime import prepare_jax
 
     prepare_jax()
     if model:
         from ..model_file import load_model
 
-        return load_model(model)[0]
+        return load_model(model)
     from ..bench import load_bench
 
-    return load_bench(bench or "aa-050h").actuator()
+    bench = load_bench(bench or "aa-050h")
+    return bench.actuator(), bench
 
 
-def read_trajectory(path):
-    """(time, displacement) of a CSV; raises `RecordingError` naming what is missing."""
-    from ..readers import UNITS, _parse, _read_csv
+def read_trajectory(path, columns=None):
+    """(time, displacement) of a CSV, in SI; raises `RecordingError` naming what is missing.
+
+    `columns`: a bench's column map; it holds for the columns that are there by its names, others go by the usual names.
+    """
+    from ..readers import USUAL, _column, _find, _read_csv
 
     if not path.exists():
         raise RecordingError(f"{path}: no such file; check the name")
@@ -119,15 +123,15 @@ def read_trajectory(path):
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise RecordingError(f"{path}: cannot be read as CSV ({reason}); give a table with time_s and displacement_m") from None
-    found = {}
-    for name, values in table.items():
-        quantity, unit = _parse(name)
-        if quantity in ("time", "displacement"):
-            found[quantity] = values * UNITS[quantity].get(unit, 1.0)
-    for quantity, usual in (("time", "time_s"), ("displacement", "displacement_m")):
-        if quantity not in found:
-            raise RecordingError(f"{path}: no {quantity} column among {', '.join(table)}; name it {usual}")
-    time, wanted = found["time"], found["displacement"]
+    found = []
+    for quantity in ("time", "displacement"):
+        mapped = (columns or {}).get(quantity, {})
+        if mapped.get("name") not in table:
+            mapped = {}
+        if _column(table, quantity, mapped)[0] is None:
+            raise RecordingError(f"{path}: no {quantity} column among {', '.join(table)}; name it {USUAL[quantity]}")
+        found.append(_find(path, table, quantity, mapped, required=True))
+    time, wanted = found
     steps = np.diff(time)
     if len(time) < 4 or not np.all(np.isfinite(wanted)) or not np.all(np.isfinite(time)):
         raise RecordingError(f"{path}: needs at least four samples and no gaps in time or displacement; fill or cut them")

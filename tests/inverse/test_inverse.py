@@ -254,13 +254,30 @@ def test_a_bad_trajectory_is_one_line_and_writes_nothing(tmp_path, capsys, conte
     assert words in text and text.count("\n") == 1 and [f.name for f in tmp_path.iterdir()] == [path.name]
 
 
+def test_a_trajectory_is_read_by_the_benchs_names(tmp_path):
+    from magjax.bench import load_bench
+    from magjax.inverse.command import read_trajectory
+
+    path = tmp_path / "wanted.csv"
+    path.write_text("t,gap\n" + "".join(f"{k},{30 + k}\n" for k in range(9)))
+    (tmp_path / "b.toml").write_text(
+        '[columns.time]\nname = "t"\nunit = "ms"\n[columns.displacement]\nname = "gap"\nunit = "um"\nscale = -1\n'
+    )
+    columns = load_bench(tmp_path / "b.toml").columns
+    time, wanted = read_trajectory(path, columns)
+    assert time == pytest.approx(1e-3 * np.arange(9)) and wanted == pytest.approx(-1e-6 * (30 + np.arange(9)))
+    path.write_text("time_s,displacement_um\n" + "".join(f"{k}e-3,{30 + k}\n" for k in range(9)))  # the usual names serve, too
+    assert read_trajectory(path, columns)[1] == pytest.approx(1e-6 * (30 + np.arange(9)))
+
+
 def test_what_is_not_compensated_is_named(tmp_path, capsys, monkeypatch):
     import magjax.inverse.command as command
+    from magjax.bench import load_bench
     from magjax.cli import main
     from magjax.effects import Backlash, SensorLag
 
     known = actuator(12).with_effect(AmplifierLag(tau=1e-4)).with_effect(SensorLag(tau=1e-4)).with_effect(Backlash())
-    monkeypatch.setattr(command, "load_actuator", lambda bench, model: known)
+    monkeypatch.setattr(command, "load_actuator", lambda bench, model: (known, load_bench("aa-050h")))
     t = 1e-4 * np.arange(300)
     wanted = np.stack([t, 33.0 + 3.0 * np.sin(2 * np.pi * 20 * t) * np.minimum(1, t / 0.02)], axis=1)
     np.savetxt(tmp_path / "w.csv", wanted, delimiter=",", header="time_s,displacement_um", comments="")

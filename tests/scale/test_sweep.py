@@ -67,6 +67,16 @@ def test_several_devices(plain, tmp_path):
             assert found[name].values == pytest.approx(plain[name].values, rel=1e-12)
 
 
+@pytest.mark.parametrize(("frequencies", "why"), [
+    ("10:300:100000000000", "values along one axis"), ("10:300:0", "give 1 to"), ("10:300:900000", "54,000,000 steady states in one sweep"),
+])  # fmt: skip
+def test_a_sweep_that_no_memory_holds_is_refused(tmp_path, capsys, frequencies, why):
+    arguments = ["--frequencies", frequencies, "--amplitudes", "0.1:0.8:60", "--out", str(tmp_path / "a.nc"), "--quiet"]
+    assert main(["sweep", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert why in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
 def test_on_the_command_line(tmp_path, capsys):
     arguments = ["sweep", "--frequencies", "10,60", "--amplitudes", "0.3,0.6", "--checkpoint", str(tmp_path / "kept"), "--json"]
     assert main([*arguments, "--out", str(tmp_path / "a.nc")]) == 0
