@@ -100,7 +100,10 @@ def _alike(a: Candidate, b: Candidate) -> float:
 def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
     """Fit base + effect, started at the screening's amplitude and from the density of the base.
 
-    `task`: a `Task`; `target`: a chi2 that it must come near to be of use.
+    `task`: a `Task`; `target`: a chi2 that it must come near to be of use. The screening's amplitude goes with a move of all
+    other parameters, which stand where the base had them: where the base hides most of the effect that start may be so
+    far off that the fit ends worse than without it. Then it begins anew nearer to none, from where the misfit is no
+    larger than the base's.
     """
     effect_class = CLASSES[candidate.name]
     info = effect_class.parameters()[effect_class.amplitude]
@@ -114,7 +117,20 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
         result = task.fit(actuator, choices=base.choices, spectra=base.spectra, refine=False, target=target)
     else:
         result = task.fit_on(base, actuator, target=target)
+        if not chi2_of(result) < chi2_of(base) and chi2_of(base) - candidate.z**2 < target:
+            nearer = effect.with_amplitude(amplitude * _no_farther(candidate, base))
+            result = min(result, task.fit_on(base, base.actuator.with_effect(nearer), target=target), key=_finite_chi2)
     return credited(candidate, result, base, effect, excess)
+
+
+def _no_farther(candidate, base) -> float:
+    """Share of the screening's amplitude that alone, all else held, moves the residual by no more than the misfit."""
+    alone = abs(candidate.z) / max(candidate.visibility, 1e-9)
+    return min(0.3, float(np.sqrt(max(excess_of(base), MIN_DROP))) / max(alone, 1e-9))
+
+
+def _finite_chi2(result) -> float:
+    return chi2_of(result) if np.isfinite(result.chi2_per_sample) else np.inf
 
 
 def settled(task, base, trial, excess, target: float = np.inf) -> Trial:

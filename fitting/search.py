@@ -45,6 +45,7 @@ LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a fur
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
 LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
 IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise
+NOTHING = 2.0  # standard errors within which an amplitude is none
 FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
 NEAR_SHARE = 0.25  # of an early effect's fall, within which too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
@@ -188,12 +189,15 @@ def _predicts_worse(before, after, check, bench) -> bool:
 def _backward(task, state):
     """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open.
 
-    The form error of a right effect looks like another effect until the rest is in place.
+    The form error of a right effect looks like another effect until the rest is in place. So is the last one dropped where it
+    has come out as nothing: what it seemed to take, the others took when they were fitted once more beside it.
     """
-    for step in state.steps[:-1][::-1]:
+    for step in state.steps[::-1]:
         name = step[0].name
         actuator = state.current.actuator
         if name not in {e.name for e in actuator.effects}:
+            continue
+        if step is state.steps[-1] and (len(state.steps) == 1 or not _nothing(state.current, name)):
             continue
         task.say(f"without {name}", state.current.chi2_per_sample)
         most = max(chi2_of(state.current) + MIN_DROP, chi2_of(state.current) + excess_of(state.current, NULL_CHI2))
@@ -202,6 +206,13 @@ def _backward(task, state):
         if rise < max(MIN_DROP, HALF * excess_of(trial, NULL_CHI2)):
             state.steps.remove(step)
             state.current = trial
+
+
+def _nothing(result, name) -> bool:
+    """Whether an effect's amplitude is within its errors of none."""
+    effect = result.actuator.effect(name)
+    found = result.estimate(f"effects.{name}.{effect.amplitude}")
+    return abs(found.value - effect.parameters()[effect.amplitude].null) < NOTHING * (found.stderr or 0.0)
 
 
 def _exchange(task, state):

@@ -313,6 +313,57 @@ def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypat
     assert found.current.chi2_per_sample == (1.4 if taken else 2.0)
 
 
+@pytest.mark.parametrize(
+    ("value", "left", "kept"), [(0.001, 1.05, 1), (0.001, 1.6, 2), (0.5, 1.05, 2)], ids=["nothing", "needed", "seen"]
+)
+def test_the_last_effect_is_dropped_where_it_has_come_out_as_nothing(value, left, kept):
+    """Its amplitude is within its errors of none, and the fit without it, from where it led, is as good: it moved the others."""
+
+    @dataclasses.dataclass
+    class Fitted:
+        chi2_per_sample: float
+        actuator: object
+        data_count: int = COUNT
+
+        def estimate(self, name):
+            assert name == "effects.magnetic_aftereffect.share"
+            return SimpleNamespace(value=value, stderr=0.003)
+
+    effects = (CLASSES["rate_dependent_switching"](), CLASSES["magnetic_aftereffect"]())
+    actuator = SimpleNamespace(
+        effects=effects, effect=lambda name: next(e for e in effects if e.name == name), without_effect=lambda name: name
+    )
+    found = Fitted(1.04, actuator)
+    state = Reached(found, [(trial(e.name, 1.04), [], [], None) for e in effects], {})
+
+    def without(current, fewer, target):
+        return Fitted(left if fewer == "magnetic_aftereffect" else 9.0, actuator)
+
+    fitting.search._backward(SimpleNamespace(say=lambda *a: None, fit_on=without), state)
+    assert [step[0].name for step in state.steps] == ["rate_dependent_switching", "magnetic_aftereffect"][:kept]
+
+
+@pytest.mark.parametrize(
+    ("far", "starts", "ends"), [(150.0, 2, 1.2), (30.0, 1, 30.0), (np.nan, 2, 1.2)], ids=["worse", "better", "lost"]
+)
+def test_a_start_from_which_a_fit_ends_worse_than_without_the_effect_is_taken_nearer(far, starts, ends):
+    """The score's amplitude goes with a move of all else, and the base hides 99 % of this effect: alone it moves far too much."""
+    base = trial("structural_damping", 40.0, base=2000.0).result
+    base.actuator = SimpleNamespace(with_effect=lambda effect: effect)
+    begun = []
+
+    def fit_on(start, effect, target):
+        begun.append(float(effect.gain))
+        return SimpleNamespace(
+            chi2_per_sample=far if len(begun) == 1 else 1.2, data_count=COUNT, actuator=SimpleNamespace(effects=()), converged=True
+        )
+
+    c = dataclasses.replace(candidate("creep", 100.0, visibility=0.01), amplitude=0.1)
+    found = fitting.attribute.try_effect(SimpleNamespace(fit_on=fit_on), base, c, 39.0 * COUNT)
+    assert found.result.chi2_per_sample == ends and len(begun) == starts and begun[0] == 0.1
+    assert begun[1:] in ([], [pytest.approx(0.1 * np.sqrt((40.0 - 0.92) * COUNT) / 1e4)])
+
+
 @pytest.mark.parametrize(("changed", "asked"), [(False, [0, 1]), (True, [0, 1, 2])])
 def test_where_an_early_effect_is_exchanged_so_may_the_last_be(monkeypatch, changed, asked):
     found = []
