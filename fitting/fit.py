@@ -74,7 +74,7 @@ def fit(
 
     start = None if start is not None and _changes_scale(bench, names, start) else start
     problem, z = build_problem(
-        spectra, actuator, bench, names, dataclasses.replace(choices, rest=_rests(bench, choices)[0]), _density(start)
+        spectra, actuator, bench, names, dataclasses.replace(choices, rest=rests_of(bench, choices)[0][0]), _density(start)
     )
     data_residual(problem, z), data_jacobian(problem, z)  # compiles both
     warm = time.perf_counter() - begin
@@ -94,17 +94,22 @@ def fit_or_stop(*arguments, **options) -> FitResult:
     return result
 
 
-RESTS = {"negative_saturation": "negative", "demagnetized": "demagnetized", "positive_saturation": "positive"}
-RESTS_IN_ORDER = tuple(RESTS.values())
+RESTS = {  # a rod is demagnetized with its bias on, or before that was put on
+    "negative_saturation": ("negative",), "demagnetized": ("demagnetized", "virgin"), "positive_saturation": ("positive",),
+}  # fmt: skip
+RESTS_IN_ORDER = tuple(found[0] for found in RESTS.values())
 
 
-def _rests(bench, choices):
-    """Start memories to try, in order."""
+def rests_of(bench, choices):
+    """Start memories to try, in order: those that the bench states, and those that stand in where none of these serves."""
     if choices.rest != "auto":
-        return (choices.rest,)
+        return (choices.rest,), ()
     if isinstance(bench.start, tuple):  # a history of fields
-        return ("negative",)
-    return (RESTS[bench.start],) if bench.start in RESTS else RESTS_IN_ORDER
+        return ("negative",), ()
+    if bench.start not in RESTS:
+        return RESTS_IN_ORDER, ()
+    stated = RESTS[bench.start] if bench.drive == "current" else RESTS[bench.start][:1]  # no bias to put on
+    return stated, tuple(rest for rest in RESTS_IN_ORDER if rest not in stated)
 
 
 def _changes_scale(bench, names, start) -> bool:
@@ -118,8 +123,11 @@ def _density(start):
 
 
 def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):
-    """The fit from each start memory until one meets the noise; the best of them. The first by itself, then the others side by side."""
-    rests = _rests(bench, choices)
+    """The fit from each start memory until one meets the noise; the best of them. The first by itself, then the others side by side.
+
+    One that the bench does not state is taken only where it meets the noise and none that it states does.
+    """
+    rests, others = rests_of(bench, choices)
 
     def run(rest, posed=None):
         tried = dataclasses.replace(choices, rest=rest)
@@ -149,13 +157,15 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
     ended = [run(rests[0], (problem, z))(report)]
     if not serves(*ended[0][:2])[0] and not ended[0][1].interrupted:
         try:
-            ended += together([run(rest) for rest in rests[1:]], report)
+            ended += together([run(rest) for rest in (*rests[1:], *others)], report)
         except KeyboardInterrupt:
             known, found, tried = ended[0]
             ended = [(known, dataclasses.replace(found, converged=False, interrupted=True), tried)]
     best = None
     for known, found, tried in ended:
         settled, score = serves(known, found)
+        if tried.rest in others and not settled:
+            continue
         if best is None or score < best[3]:
             best = (known, found, tried, score)
         if settled:
@@ -247,6 +257,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
         + valleys(related)
         + unsettled(problem.spectra)
         + guessed(recordings, bench)
+        + _contradicted(bench, choices)
     )
     lost = not chi2n < LOST or (chi2n > AT_BOUND and any(e.at_bound for e in rows))
     return FitResult(
@@ -254,6 +265,14 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
         problem.spectra, choices,
     )  # fmt: skip
+
+
+def _contradicted(bench, choices) -> str:
+    """A sentence where the recordings are met from another start than the bench states."""
+    if bench.start not in RESTS or choices.rest in (*RESTS[bench.start], "held", "auto"):
+        return ""
+    met = "the demagnetized state" if choices.rest == "demagnetized" else f"{choices.rest} saturation"
+    return f"; the recordings are not met from the start that the bench states, {bench.start}, but from {met}"
 
 
 def recording_fits(problem, residual, recordings, bench):

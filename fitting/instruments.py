@@ -16,8 +16,8 @@ from magjax.errors import RecordingError
 from magjax.instruments import SENSOR_LAWS, fit_laws, judge_laws, judge_source
 
 from .check import check_errors
-from .fit import RESTS_IN_ORDER
 from .fit import fit_or_stop as fit
+from .fit import rests_of
 from .joint import data_residual
 from .setup import build_problem, effect_parameters, free_parameters, spectra_of
 from .spectra import line_deviations, reduce_recording, with_noise
@@ -232,7 +232,7 @@ def nearest_start(recordings, bench, actuator, choices):
     spectra = spectra_of(recordings, bench, choices.harmonics)
     names = free_parameters(bench, actuator)
     grid = {n: [float(actuator.parameters()[n][0]) * f for f in factors] for n, factors in START_GRID.items() if n in names}
-    rest = dataclasses.replace(choices, rest=RESTS_IN_ORDER[0]) if choices.rest == "auto" else choices
+    rest = dataclasses.replace(choices, rest=rests_of(bench, choices)[0][0])
     best = (np.inf, actuator)
     for values in itertools.product(*grid.values()):
         trial = actuator.replace(dict(zip(grid, values, strict=True)))

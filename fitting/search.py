@@ -32,7 +32,7 @@ from .attribute import (
     try_effect,
 )
 from .check import check_errors
-from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, RESTS_IN_ORDER
+from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, rests_of
 from .instruments import RINGING, mode_as_filter
 from .screen import screen
 from .together import SIDE_BY_SIDE, let_go, together
@@ -326,11 +326,11 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
     better by MIN_DROP.
     """
     found = chosen = task.choices
-    later = chosen.rest != RESTS_IN_ORDER[0]
-    if any_rest and task.bench.start == "auto" and (later or best.result.chi2_per_sample > REST_SETTLED):
-        free = dataclasses.replace(chosen, rest="auto")
+    free = dataclasses.replace(chosen, rest="auto")
+    order = sum(rests_of(task.bench, free), ())
+    if any_rest and len(order) > 1 and (chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED):
         other = task.fit_on(best.result, best.result.actuator, choices=free)
-        margin = MIN_DROP if RESTS_IN_ORDER.index(other.choices.rest) < RESTS_IN_ORDER.index(chosen.rest) else -MIN_DROP
+        margin = MIN_DROP if order.index(other.choices.rest) < order.index(chosen.rest) else -MIN_DROP
         if chi2_of(other) < chi2_of(best.result) + margin:
             found = other.choices
     if any_density and chosen.knots is not None and FINER_FROM[0] < best.result.chi2_per_sample < REFINE_BESIDE:

@@ -36,7 +36,7 @@ class Choices:
     harmonics: int = HARMONICS
     max_jacobians: int = 30
     without: tuple[str, ...] = ()  # effects that a diagnosis does not ask for: their instrument was measured
-    rest: str = "auto"  # start memory: "negative", "demagnetized" about the drive's zero, "positive", or tried in turn
+    rest: str = "auto"  # start memory: "negative", "demagnetized" about the drive's zero, "virgin": about no field, "positive", or tried in turn
 
 
 def spectra_of(recordings, bench, harmonics: int = HARMONICS):
@@ -131,7 +131,8 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         level = 2 * choices.level if known_field else choices.level
         basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive != "current")
     zero = float(in_numpy(actuator.coil).applied_field(0.0))
-    rest = {"demagnetized": float(np.clip(zero, basis.low, basis.high)), "positive": basis.high}.get(choices.rest, basis.low)
+    about = {"demagnetized": zero, "virgin": 0.0, "positive": basis.high}.get(choices.rest, basis.low)
+    rest = float(np.clip(about, basis.low, basis.high))
     harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
     deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
     full = [line_deviations(s, s.noise) for s in spectra]

@@ -122,6 +122,17 @@ def test_the_fit_finds_a_demagnetized_start():
     assert wrong.chi2_per_sample > 3
 
 
+@pytest.mark.parametrize(("stated", "rest", "found", "told"), [
+    ("demagnetized", 0.0, "virgin", False), ("demagnetized", 1.23e4, "demagnetized", False), ("positive_saturation", 1.23e4, "demagnetized", True),
+])  # fmt: skip
+def test_a_start_that_the_bench_states(stated, rest, found, told):
+    """A rod is demagnetized with its bias on or before; a start that the recordings contradict is told, and what they say is taken."""
+    made, bench = recordings_from(rest)
+    result = fit(made, dataclasses.replace(bench, start=stated), refine=False)
+    assert result.choices.rest == found and result.chi2_per_sample < 1.1
+    assert ("not met from the start that the bench states" in result.message) is told
+
+
 def test_the_recipe_of_section_2_3():
     actuator = load_bench("aa-050h").actuator()
     made = []

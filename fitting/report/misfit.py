@@ -209,6 +209,7 @@ def spectrum(evidence, output: str, stem: str = "spectrum"):
 STAGES = {
     "fit from negative": "from negative saturation",
     "fit from demagnetized": "from the demagnetized state",
+    "fit from virgin": "from the state demagnetized before the bias",
     "fit from positive": "from positive saturation",
 }  # start memories, in words
 
