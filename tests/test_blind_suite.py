@@ -19,7 +19,7 @@ from tests.blind.generator.instruments import record
 from tests.blind.generator.strain import settled_play
 from tests.blind.oracle import Sight
 from tests.blind.run import diagnose, run_cases
-from tests.blind.score import coverage, judge, kept_line, wilson
+from tests.blind.score import coverage, judge, kept_line, read, wilson
 from tests.blind.strengths import GROUPS, HIDDEN, OUTSIDE, VISIBLE
 
 FOLDER = Path(__file__).parent / "blind"
@@ -234,3 +234,10 @@ def test_sample_through_the_command_line(tmp_path):
     assert judge(case, said) == "right", said["message"]
     kept = json.loads(kept_line(case.name, ended, said))["diagnosis"]  # a row of --keep scores the same
     assert judge(case, kept) == "right" and list(coverage(case, kept)) == list(coverage(case, said)) and len(kept["check"]) == 1
+
+
+def test_rows_of_another_suite_are_refused(tmp_path):
+    (tmp_path / "rows.jsonl").write_text(kept_line("val-003", {"status": 0, "seconds": 1.0}, None) + "\n")
+    assert [case.name for case, *_ in read("val", tmp_path / "rows.jsonl")] == ["val-003"]
+    with pytest.raises(SystemExit, match="no case of test"):
+        list(read("test", tmp_path / "rows.jsonl"))

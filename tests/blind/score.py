@@ -82,6 +82,8 @@ def _naming(truth, named, grouped, groups):
 def read(suite: str, out: Path):
     """(case, diagnosis or None, done) of every case that is done: from the runner's folder or from a file of --keep."""
     for name, done, diagnosis in _kept(Path(out)) if Path(out).is_file() else _folders(suite, Path(out)):
+        if name.rpartition("-")[0] != suite:
+            raise SystemExit(f"{out}: holds {name}, which is no case of {suite}; give the rows of one suite")
         if done["status"] != GENERATOR_FAILED:  # a bench that could not be made says nothing
             yield make_case(suite, int(name.rpartition("-")[2])), diagnosis, done
 

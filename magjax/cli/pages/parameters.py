@@ -43,7 +43,8 @@ SETTINGS = {
     "hysteresis.levels": "levels L of the Preisach plane that `simulate` starts from, 2 to 400 (default 25)",
     "hysteresis.start": "magnetic state before a simulation: "
     + ", ".join(f'"{s}"' for s in bench.STARTS)
-    + ' (default "auto", which is "negative_saturation"; a fit tries the three; "demagnetized" stands for the bias being on then, or put on later), or a list of the fields, A/m, that led there from negative saturation, oldest first',
+    + ' (default "auto", which is "negative_saturation"; a fit tries the three; "demagnetized" with the bias on, or before it), '
+    + "or a list of the fields, A/m, that led there from negative saturation, oldest first",
     "limits.current_A": "largest current, A: bounds the Preisach plane of `simulate` (by 0.9 where none is stated), what `record` may drive and what is asked for next",
     "limits.field_A_per_m": "the same for a bench that is driven by a field, A/m (300 where none is stated)",
     "limits.voltage_V": "the same for a piezo stack, V (150 where none is stated)",
