@@ -10,6 +10,7 @@ import pytest
 
 import magjax.effects as effects
 from magjax.chain import BLOCKS, Timeline
+from magjax.chain.coupled import magnetize
 from magjax.chain.mechanics import Mechanics
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.simulate import run_chain, simulate
@@ -279,3 +280,18 @@ def test_the_stress_of_a_moved_mass_is_that_of_its_acceleration():
         shift = shift * np.asarray(found.magnetization)
         felt = np.asarray(found.field - found.relay_field)
         assert np.abs(felt).max() > 10 and np.abs(felt - shift).max() < 0.03 * np.ptp(shift)
+
+
+@pytest.mark.parametrize("of_drive", [0.0, 0.4, 0.7, 1.0])
+def test_thresholds_widen_by_the_relays_own_rate_or_by_that_of_the_applied_field(of_drive):
+    """With an eddy loss the two rates differ: the shift is the law's, of the fields as they come out, at every step."""
+    gamma, rate0 = 150.0, 2e5
+    act = actuator().with_effect(effects.RateDependentSwitching(gamma=gamma, rate0=rate0, of_drive=of_drive))
+    applied = act.coil.applied_field(CURRENT)
+    memory = act.hysteresis.memory(act.hysteresis.table(), 8)
+    H, _, v, residual, _ = magnetize(act, applied, CURRENT, DT, memory, "bdf2")
+    own, driven = np.diff(v) / DT, np.abs(np.diff(applied)) / DT
+    rate0 = rate0 + 1e-3
+    law = gamma * ((1 - of_drive) * np.arcsinh(own / rate0) + of_drive * np.arcsinh(driven / rate0) * own / np.hypot(own, rate0))
+    assert np.asarray(H - v)[1:] == pytest.approx(law, abs=1e-6 * gamma) and np.abs(law).max() > gamma
+    assert np.abs(residual).max() < 1e-5

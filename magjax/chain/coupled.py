@@ -29,7 +29,7 @@ from ..preisach.memory import Memory, apply_field, branch_magnetization
 SCHEMES = ("bdf2", "trapezoid")
 LOSSES = ("source", "coil")  # blocks whose effects take from the applied field
 CLOSE_ENOUGH = 1e-12  # of half the plane; the polish squares what is left
-MOST_STEPS = 60  # a bisection alone gets there
+MOST_STEPS = 100  # each halves the bracket or the step
 
 
 class _Carry(eqx.Module):
@@ -365,11 +365,12 @@ def _solve_with_effects(table, c, effects, actuator, trial_at, p, q, rhs):
     reach = 0.5 * frozen_table.step * frozen_table.cells
 
     def refine(bracket):
-        v, lo, hi, _, number = bracket
+        v, lo, hi, last, number = bracket
         (value, _), (slope, _) = jax.jvp(excess, (v,), (jnp.ones_like(v),))
         lo, hi = jnp.where(value <= 0, v, lo), jnp.where(value > 0, v, hi)
         newton = v - value / jnp.where(slope > 0, slope, pf)
-        inside = (newton > lo) & (newton < hi) & (slope > 0)
+        # by no more than half the last step, or it may go to and fro over a steep place for ever
+        inside = (newton > lo) & (newton < hi) & (slope > 0) & (jnp.abs(newton - v) <= 0.5 * last)
         new = jnp.where(value == 0, v, jnp.where(inside, newton, 0.5 * (lo + hi)))
         return new, lo, hi, jnp.abs(new - v), number + 1
 
