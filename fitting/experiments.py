@@ -156,7 +156,7 @@ def _predicted(result, drives, spectra):
     )
     r, J = (np.asarray(x) for x in _lines_and_slopes(problem.layout, jnp.asarray(solution.z), target, problem.template, predictor))
     at = [np.concatenate([k * count + np.arange(count), m * count + k * (count - 1) + np.arange(count - 1)]) for k in range(m)]
-    return r[np.array(at)], J[np.array(at)], covariance(solution.normal, solution.z, problem.layout.density_unknowns)
+    return r[np.array(at)], J[np.array(at)], covariance(solution.normal, solution.z, problem.layout)
 
 
 def _asked(spectrum, f, A, offset):

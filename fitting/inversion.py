@@ -12,7 +12,7 @@ def mass_errors(result) -> np.ndarray:
     """
     layout = result.problem.layout
     n = layout.density_unknowns
-    hats = covariance(result.solution.normal, result.solution.z, n)[:n, :n]
+    hats = covariance(result.solution.normal, result.solution.z, layout)[:n, :n]
     cells = np.asarray(layout.cells)
     variance = np.einsum("ij,jk,ik->i", cells, hats, cells, optimize=True)
     side = int(round(np.sqrt(len(cells))))

@@ -149,7 +149,7 @@ def evidence_weights(layout: Layout, z, normal, weights):
     """One MacKay update of each roughness weight: effective number of unknowns over roughness."""
     n = layout.density_unknowns
     z = np.asarray(z)
-    active = np.append(z[:n] > 0, np.ones(len(z) - n, bool))
+    active = layout.inside(z)
     # unknowns at their bound carry no freedom: the inverse on the free set only
     inside = np.flatnonzero(active)
     S = np.zeros_like(normal)
@@ -183,12 +183,13 @@ def bent_step(problem: Problem, z, new, residual, J, normal, damping):
     """The step from z to `new`, bent as the valley is: geodesic acceleration (Transtrum, Sethna 2012), central differences."""
     delta = new - z
     curvature = (data_residual(problem, z + BEND * delta) - 2 * residual + data_residual(problem, z - BEND * delta)) / BEND**2
-    free = np.flatnonzero(~np.asarray(problem.layout.nonnegative) | (new > 0))
+    lower, upper = problem.layout.bounds
+    free = np.flatnonzero((new > lower) & (new < upper))
     scale = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
     matrix = normal[np.ix_(free, free)] * scale[:, None] * scale + damping * np.eye(len(free))
     bent = new.copy()
     bent[free] -= 0.5 * scale * np.linalg.solve(matrix + 1e-12 * np.eye(len(free)), scale * (J[:, free].T @ curvature))
-    return np.where(problem.layout.nonnegative, np.maximum(bent, 0.0), bent)
+    return np.clip(bent, lower, upper)
 
 
 def cost_of(residual, z, prior) -> float:
@@ -208,7 +209,7 @@ def solve(
     lead there the iteration ends.
     """
     layout, count = problem.layout, problem.data_count
-    bounded = jnp.asarray(layout.nonnegative)
+    bounds = tuple(map(jnp.asarray, layout.bounds))
     z, weights = np.asarray(z, float), np.asarray(weights, float)
     prior = prior_matrix(problem, weights)
     begin, converged, interrupted, taken, damping, decrement, held = time.perf_counter(), False, False, 0, 1e-2, np.inf, np.inf
@@ -223,7 +224,7 @@ def solve(
             normal, gradient = information + prior, J.T @ residual + prior @ z
             good = False
             for _ in range(8):
-                new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounded))
+                new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounds))
                 trial = data_residual(problem, new)
                 new_cost = cost_of(trial, new, prior)
                 ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0
@@ -237,7 +238,7 @@ def solve(
                 damping = max(damping * (0.15 if ratio > 0.5 else 1.0 if good else 6.0), 1e-9)
                 if good or float(predicted) < 1e-6 * cost + 1e-3:
                     break
-            decrement = float(damped_step(normal, gradient, z, 1e-9, bounded)[1])
+            decrement = float(damped_step(normal, gradient, z, 1e-9, bounds)[1])
             gains.append(cost - new_cost if good else 0.0)
             if good:
                 z, residual, cost = new, trial, new_cost

@@ -102,7 +102,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
             raise KeyboardInterrupt
         first = problem.layout.index(names[len(base.problem.layout.names)])
         index = slice(first, first + len(term.coefficients))
-        cov = covariance(solution.normal, solution.z, n)
+        cov = covariance(solution.normal, solution.z, problem.layout)
         values = np.array(
             [float(problem.layout.value(name, jnp.asarray(solution.z))) for name in names[len(base.problem.layout.names) :]]
         )

@@ -34,8 +34,9 @@ class Layout(eqx.Module):
 
     The last carry a tight prior (MEMORY of the total): what the start transient left in relays that later never switch.
 
-    A parameter is start * exp(z) where it must stay positive (`log`), else start + scale * z. The arrays are traced,
-    so that fits of the same shape share one compiled program.
+    A parameter is start * exp(z) where it must stay positive (`log`), else start + scale * z. `lows` and `highs`: the
+    parameters' bounds in SI, infinite where the fit keeps none. The arrays are traced, so that fits of the same shape share
+    one compiled program.
     """
 
     cells: jax.Array
@@ -43,17 +44,19 @@ class Layout(eqx.Module):
     total: jax.Array
     starts: jax.Array
     scales: jax.Array
+    lows: jax.Array
+    highs: jax.Array
     names: tuple[str, ...] = eqx.field(static=True)
     log: tuple[bool, ...] = eqx.field(static=True)
     memories: int = eqx.field(static=True, default=0)
     held: jax.Array | None = None
 
     @staticmethod
-    def build(basis, names, starts, scales, log, memories: int = 0) -> "Layout":
-        """From a density basis and the free parameters' names, start values, scales and coordinate kinds."""
+    def build(basis, names, starts, scales, lows, highs, log, memories: int = 0) -> "Layout":
+        """From a density basis and the free parameters' names, start values, scales, bounds and coordinate kinds."""
         return Layout(
             on_device(basis.cells), tuple(on_device(D) for D in basis.penalties), on_device(basis.total),
-            on_device(starts), on_device(scales), tuple(names), tuple(log), memories,
+            on_device(starts), on_device(scales), on_device(lows), on_device(highs), tuple(names), tuple(log), memories,
             None if basis.held is None else on_device(basis.held),
         )  # fmt: skip
 
@@ -68,9 +71,24 @@ class Layout(eqx.Module):
         return self.density_unknowns + 1 + len(self.names) + self.memories
 
     @property
-    def nonnegative(self) -> np.ndarray:
-        """Which unknowns must not be negative."""
-        return np.arange(self.size) < self.density_unknowns
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest value of each unknown: masses are not negative, parameters keep what bounds they have."""
+        n, starts = self.density_unknowns, np.asarray(self.starts)
+        found = []
+        for ends, every, masses in ((self.lows, -np.inf, 0.0), (self.highs, np.inf, np.inf)):
+            ends = np.asarray(ends)
+            bound = np.full(self.size, every)
+            bound[:n] = masses
+            with np.errstate(divide="ignore", invalid="ignore"):
+                own = np.where(np.asarray(self.log, bool), np.log(ends / starts), (ends - starts) / np.asarray(self.scales))
+            bound[n + 1 : n + 1 + len(ends)] = np.where(np.isfinite(ends), own, every)
+            found.append(bound)
+        return found[0], found[1]
+
+    def inside(self, z) -> np.ndarray:
+        """Which unknowns are not at a bound."""
+        lower, upper = self.bounds
+        return (z > lower) & (z < upper)
 
     def index(self, name: str) -> int:
         """Where a parameter stands in the vector."""
@@ -101,9 +119,9 @@ class Layout(eqx.Module):
         place = np.concatenate([np.arange(n), n + np.asarray(kept, int), np.arange(n + len(self.names), self.size)])
         if len(kept) == len(self.names):
             return self, place
-        starts, scales = (jnp.asarray(np.asarray(x)[kept]) for x in (self.starts, self.scales))
+        numbers = {x: jnp.asarray(np.asarray(getattr(self, x))[kept]) for x in ("starts", "scales", "lows", "highs")}
         names, log = (tuple(x[k] for k in kept) for x in (self.names, self.log))
-        return dataclasses.replace(self, starts=starts, scales=scales, names=names, log=log), place
+        return dataclasses.replace(self, **numbers, names=names, log=log), place
 
     def levels(self, z):
         """What each recording's start transient adds to M, A/m, (recordings,) or None."""

@@ -157,7 +157,12 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     infos = [known[n][1] for n in names]
     log = [i.low >= 0 and v > 0 and (i.null is None or i.shape) for i, v in zip(infos, values, strict=True)]
     scales = [i.scale for i in infos]
-    layout = Layout.build(basis, names, values, scales, log, memories)
+    ends = [
+        (i.low if i.shape else -np.inf, i.high) if n.startswith("effects.") else (-np.inf, np.inf)
+        for n, i in zip(names, infos, strict=True)
+    ]
+    lows, highs = (np.asarray(x) for x in zip(*ends, strict=True)) if ends else (np.zeros(0), np.zeros(0))
+    layout = Layout.build(basis, names, values, scales, lows, highs, log, memories)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
     corners = int(4 * np.ceil(corners / 4))

@@ -1,7 +1,7 @@
 """Projected Levenberg-Marquardt for bounded, scaled least squares, behind optimistix's interface.
 
-optimistix brings no bounds and one Jacobian a trial; here the nonnegative unknowns are kept by block pivoting on the
-normal equations, the Jacobian is built in chunks of columns by `linearize`, may come from a coarser grid than the
+optimistix brings no bounds and one Jacobian a trial; here bounds (a pair of arrays, lower and upper, infinite where there is
+none) are kept by block pivoting on the normal equations, the Jacobian is built in chunks of columns by `linearize`, may come from a coarser grid than the
 residual (`options["jacobian_fn"]`), and one step is one Jacobian with as many trial dampings as it needs.
 """
 
@@ -31,12 +31,12 @@ class ProjectedState(eqx.Module):
 
 
 class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
-    """Levenberg-Marquardt on a flat vector with `y[i] >= 0` where `nonnegative[i]`.
+    """Levenberg-Marquardt on a flat vector between `bounds`, (lower, upper).
 
     Stops when the predicted fall of half chi2 (the Newton decrement) is below `atol` + `rtol` * cost.
     """
 
-    nonnegative: Any
+    bounds: Any
     rtol: float = 1e-5
     atol: float = 1e-2
     norm: Any = optx.max_norm
@@ -58,7 +58,7 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         def attempt(carry):
             damping, _, _, _, tried = carry
-            new, predicted = damped_step(normal, gradient, y, damping, self.nonnegative)
+            new, predicted = damped_step(normal, gradient, y, damping, self.bounds)
             new_cost = 0.5 * jnp.sum(fn(new, args)[0] ** 2)
             ratio = (cost - new_cost) / jnp.maximum(predicted, 1e-300)
             good = (ratio > 1e-3) & jnp.isfinite(new_cost)
@@ -67,7 +67,7 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         start = (state.damping, y, cost, jnp.asarray(False), jnp.asarray(0))
         damping, new, new_cost, good, _ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < self.trials), attempt, start)
-        _, decrement = damped_step(normal, gradient, y, 1e-9, self.nonnegative)
+        _, decrement = damped_step(normal, gradient, y, 1e-9, self.bounds)
         fallen = cost - new_cost
         tolerance = self.atol + self.rtol * new_cost
         done = (decrement < tolerance) | ~good
@@ -86,25 +86,25 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 @jax.jit
-def damped_step(normal, gradient, y, damping, nonnegative):
+def damped_step(normal, gradient, y, damping, bounds):
     """The bounded step under a damping relative to the diagonal: (new point, predicted fall of half chi2)."""
     scale = jnp.diagonal(normal)
     scale = scale + 1e-12 * jnp.max(scale)
-    delta = bounded_step(normal + jnp.diag(damping * scale), gradient, y, nonnegative)
-    new = jnp.where(nonnegative, jnp.maximum(y + delta, 0.0), y + delta)
+    new = bounded_minimum(normal + jnp.diag(damping * scale), gradient, y, bounds)
     delta = new - y
     return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
 
 
 def padded_step(size: int):
-    """`bounded_step` for systems of up to `size` unknowns through the program that the fit's own steps of that size run."""
+    """A bounded step for systems of up to `size` unknowns through the program that the fit's own steps of that size run."""
 
-    def step(A, gradient, y, nonnegative):
+    def step(A, gradient, y, bounds):
         n = len(gradient)
         whole = np.eye(size)
         whole[:n, :n] = A
-        gradient, y, nonnegative = (np.concatenate([x, np.zeros(size - n, x.dtype)]) for x in (gradient, y, nonnegative))
-        return (np.asarray(damped_step(whole, gradient, y, 0.0, jnp.asarray(nonnegative))[0]) - y)[:n]
+        ends = ((gradient, 0.0), (y, 0.0), (bounds[0], -1.0), (bounds[1], 1.0))
+        gradient, y, lower, upper = (np.concatenate([x, np.full(size - n, v)]) for x, v in ends)
+        return (np.asarray(damped_step(whole, gradient, y, 0.0, (jnp.asarray(lower), jnp.asarray(upper)))[0]) - y)[:n]
 
     return step
 
@@ -133,8 +133,8 @@ def normal_equations(fn, y, residual):
     return J.T @ J, J.T @ residual
 
 
-def bounded_step(A, gradient, y, nonnegative, rounds: int = 25):
-    """argmin of gradient'd + d'A d/2 with y + d >= 0 where asked.
+def bounded_minimum(A, gradient, y, bounds, rounds: int = 25):
+    """The point between `bounds` where gradient'd + d'A d/2 is least, d counted from y; what ends at a bound is there exactly.
 
     Block principal pivoting on the free set, quick but without a promise; where it has not ended after `rounds`
     (a nearly singular A) a feasible active set, which falls at every step, goes on to the optimum.
@@ -142,9 +142,10 @@ def bounded_step(A, gradient, y, nonnegative, rounds: int = 25):
     scale = 1 / jnp.sqrt(jnp.maximum(jnp.diagonal(A), 1e-300))
     A = A * scale[:, None] * scale[None, :]
     g = gradient * scale
-    floor = jnp.where(nonnegative, -y, -jnp.inf) / scale
-    d, ended = _pivoted(A, g, floor, nonnegative & (y <= 0) & (gradient > 0), rounds)
-    return _descended(A, g, floor, d, ended) * scale
+    walls = tuple((bound - y) / scale for bound in bounds)
+    d, ended = _pivoted(A, g, walls, rounds)
+    d = _descended(A, g, walls, d, ended)
+    return jnp.where(d <= walls[0], bounds[0], jnp.where(d >= walls[1], bounds[1], jnp.clip(y + d * scale, *bounds)))
 
 
 def _minimum(A, g, fixed, at):
@@ -157,55 +158,64 @@ def _minimum(A, g, fixed, at):
     return jnp.where(free, jax.scipy.linalg.cho_solve(factor, jnp.where(free, -(g + A @ held), 0.0)), held)
 
 
-def _pivoted(A, g, floor, fixed, rounds):
-    """Block principal pivoting: (step, whether it is the optimum)."""
+def _pivoted(A, g, walls, rounds):
+    """Block principal pivoting between the walls, (lowest, highest) step: (step, whether it is the optimum)."""
     n = len(g)
-    floor = jnp.where(jnp.isfinite(floor), floor, -1e300)
+    floor, ceiling = (jnp.clip(wall, -1e300, 1e300) for wall in walls)
 
     def pivot(carry):
-        fixed, _, best, count, k = carry
-        d = _minimum(A, g, fixed, floor)
-        bad = (~fixed & (d < floor - 1e-12)) | (fixed & (g + A @ d < -1e-12))
+        side, _, best, count, k = carry  # -1 at the floor, 1 at the ceiling, 0 free
+        d = _minimum(A, g, side != 0, jnp.where(side < 0, floor, ceiling))
+        inward = side * (g + A @ d) > 1e-12
+        proper = jnp.where(side != 0, jnp.where(inward, 0, side), (d > ceiling + 1e-12) * 1 - (d < floor - 1e-12) * 1)
+        bad = proper != side
         number = jnp.sum(bad)
         # Murty's single exchange once the block exchange stops making progress
         worst = jnp.arange(n) == (n - 1 - jnp.argmax(bad[::-1]))
         stuck = (number >= best) & (count >= 3)
-        change = jnp.where(stuck, bad & worst, bad)
-        return fixed ^ change, d, jnp.minimum(best, number), jnp.where(number < best, 0, count + 1), k + 1
+        side = jnp.where(stuck & ~worst, side, proper)
+        return side, d, jnp.minimum(best, number), jnp.where(number < best, 0, count + 1), k + 1
 
-    start = (fixed, jnp.zeros(n), jnp.asarray(n + 1), jnp.asarray(0), jnp.asarray(0))
+    side = ((ceiling <= 0) & (g < 0)) * 1 - ((floor >= 0) & (g > 0)) * 1
+    start = (side, jnp.zeros(n), jnp.asarray(n + 1), jnp.asarray(0), jnp.asarray(0))
     _, d, left, *_ = jax.lax.while_loop(lambda c: (c[2] > 0) & (c[4] < rounds), pivot, start)
-    return jnp.maximum(d, floor), left == 0
+    return jnp.clip(d, floor, ceiling), left == 0
 
 
-def _descended(A, g, floor, d, ended, most: int = 400):
-    """The feasible active set from `d`, or from 0 where that is lower: unknowns that a step drives below their floor are fixed
+def _descended(A, g, walls, d, ended, most: int = 400):
+    """The feasible active set from `d`, or from 0 where that is lower: unknowns that a step drives past a wall are fixed
     there (all of them where that falls further than to the first of them), and freed again at the minimum of the rest."""
+    floor, ceiling = walls
     tolerance = 1e-11 * jnp.max(jnp.abs(g))
 
     def height(x):
         return g @ x + 0.5 * x @ A @ x
 
+    def outward(x, slope):
+        return ((x <= floor) & (slope > 0)) | ((x >= ceiling) & (slope < 0))
+
     def onward(carry):
         d, fixed, low, _, k = carry
         x = _minimum(A, g, fixed, d)
-        below = ~fixed & (x < floor)
-        reach = jnp.where(below, (floor - d) / jnp.where(below, x - d, -1.0), jnp.inf)
+        past = ~fixed & ((x < floor) | (x > ceiling))
+        wall = jnp.where(x < floor, floor, ceiling)
+        reach = jnp.where(past, (wall - d) / jnp.where(past, x - d, 1.0), jnp.inf)
         part = jnp.clip(jnp.min(reach), 0.0, 1.0)
-        first = below & (reach <= part)
-        whole, partly = jnp.maximum(x, floor), jnp.where(first, floor, jnp.maximum(d + part * (x - d), floor))
+        first = past & (reach <= part)
+        whole, partly = jnp.clip(x, floor, ceiling), jnp.where(first, wall, jnp.clip(d + part * (x - d), floor, ceiling))
         farther = height(whole) < height(partly)
-        blocked = jnp.any(below)
+        blocked = jnp.any(past)
         # at a minimum of the free: let go of those that pull inward, of one alone where nothing was gained since the last
         slope = g + A @ x
-        pull = fixed & (slope < -tolerance)
+        pull = jnp.where(fixed & ~outward(x, slope), jnp.abs(slope), 0.0)
+        pulled = pull > tolerance
         gained = height(x) < low - 1e-13 * jnp.abs(low)
-        released = pull & (gained | (slope <= jnp.min(jnp.where(pull, slope, jnp.inf))))
+        released = pulled & (gained | (pull >= jnp.max(pull)))
         d = jnp.where(blocked, jnp.where(farther, whole, partly), x)
-        fixed = jnp.where(blocked, fixed | jnp.where(farther, below, first), fixed & ~released)
-        return d, fixed, jnp.where(blocked, low, height(x)), ~blocked & ~jnp.any(pull), k + 1
+        fixed = jnp.where(blocked, fixed | jnp.where(farther, past, first), fixed & ~released)
+        return d, fixed, jnp.where(blocked, low, height(x)), ~blocked & ~jnp.any(pulled), k + 1
 
     start = jnp.where(ended | (height(d) < 0), d, 0.0)
-    fixed = (start <= floor) & (g + A @ start > 0)
+    fixed = outward(start, g + A @ start)
     d, *_ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < most), onward, (start, fixed, jnp.asarray(jnp.inf), ended, jnp.asarray(0)))
     return d

@@ -192,7 +192,7 @@ def equation_error_start(basis, spectra, deviations, actuator, solve, max_freque
     for weight, D in zip((3.0, 3.0, 30.0, 3.0), basis.penalties, strict=False):
         normal[:n, :n] += weight * D.T @ D
     normal += 1e-8 * np.trace(normal) / len(normal) * np.eye(n + 1)
-    solution = np.asarray(solve(normal, gradient, np.zeros(n + 1), np.arange(n + 1) < n))
+    solution = np.asarray(solve(normal, gradient, np.zeros(n + 1), (np.append(np.zeros(n), -np.inf), np.full(n + 1, np.inf))))
     misfit = float(np.sqrt(np.mean((A @ solution - b) ** 2)))
     return np.maximum(solution[:n], 0.0), float(solution[n]), misfit
 

@@ -39,10 +39,11 @@ class Estimate:
         return f"{self.name:32s} {self.value:12.6g} ± {self.stderr:<9.2g} {self.unit:10s} (start {self.start:.4g}){flags}"
 
 
-def covariance(normal: np.ndarray, z: np.ndarray, density_unknowns: int) -> np.ndarray:
-    """Inverse normal matrix on the unknowns that are not at their bound; zero elsewhere."""
-    free = np.append(z[:density_unknowns] > 0, np.ones(len(z) - density_unknowns, bool))
-    index = np.flatnonzero(free)
+def covariance(normal: np.ndarray, z: np.ndarray, layout, also=()) -> np.ndarray:
+    """Inverse normal matrix on the unknowns that are not at a bound, and on those `also` (places); zero elsewhere."""
+    inside = layout.inside(z)
+    inside[list(also)] = True
+    index = np.flatnonzero(inside)
     part = normal[np.ix_(index, index)]
     scale = 1 / np.sqrt(np.maximum(np.diag(part), 1e-300))
     inverse = np.linalg.inv(part * scale[:, None] * scale + 1e-11 * np.eye(len(index)))
@@ -54,7 +55,7 @@ def covariance(normal: np.ndarray, z: np.ndarray, density_unknowns: int) -> np.n
 def estimates(problem, solution, actuator) -> list[Estimate]:
     """Every declared parameter of the fitted actuator with its error."""
     layout = problem.layout
-    cov = covariance(solution.normal, solution.z, layout.density_unknowns)
+    cov = covariance(solution.normal, solution.z, layout)
     widen = WIDEN_BESIDE if actuator.effects else WIDEN
     rows = []
     for name, (value, info) in actuator.parameters().items():
@@ -81,7 +82,7 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
 def correlations(problem, solution) -> dict:
     """Correlation of each pair of free physical parameters: "a~b" -> coefficient."""
     layout = problem.layout
-    cov = covariance(solution.normal, solution.z, layout.density_unknowns)
+    cov = covariance(solution.normal, solution.z, layout)
     names = layout.names
     at = [layout.index(name) for name in names]
     found = {}

@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 SMOKE = (
     "tests/test_structure.py", "tests/data/test_formats.py", "tests/test_adding_an_effect.py",
-    "tests/test_fit.py::test_bounded_step_meets_the_optimality_conditions", "tests/test_fit.py::test_reaches_the_noise_and_the_constants",
+    "tests/test_fit.py::test_bounded_minimum_meets_the_optimality_conditions", "tests/test_fit.py::test_reaches_the_noise_and_the_constants",
 )  # fmt: skip
 NEWEST = ("3.14", "3.13", "3.12")
 

@@ -18,7 +18,7 @@ from fitting.density import cell_basis, hat_basis
 from fitting.fit import finer_than, fit, guessed, loose
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
-from fitting.solver import ProjectedLevenbergMarquardt, bounded_step
+from fitting.solver import ProjectedLevenbergMarquardt, bounded_minimum
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import agreeing, operator_rows, unfold
 from magjax.bench import load_bench
@@ -175,20 +175,21 @@ def test_linear_rows_are_the_operator(make):
     assert operator_rows(basis, field) @ x == pytest.approx(np.asarray(operator.magnetization(field, corners=30)), abs=1e-12)
 
 
-def test_bounded_step_meets_the_optimality_conditions():
+def test_bounded_minimum_meets_the_optimality_conditions():
     rng = np.random.default_rng(3)
     for _ in range(20):
         A = rng.standard_normal((30, 30))
         A, g, y = A @ A.T + 0.1 * np.eye(30), rng.standard_normal(30), np.maximum(rng.standard_normal(30), 0)
-        bounded = np.arange(30) < 24
-        d = np.asarray(bounded_step(jnp.asarray(A), jnp.asarray(g), jnp.asarray(y), jnp.asarray(bounded)))
-        slope = A @ d + g
-        at = bounded & (y + d < 1e-9)
-        assert (y + d)[bounded].min() > -1e-10
-        assert np.abs(slope[~at]).max() < 1e-7 and slope[at].min(initial=0) > -1e-7
+        y[20:24] = np.minimum(y[20:24], 0.1)
+        lower, upper = np.where(np.arange(30) < 24, 0.0, -np.inf), np.where(abs(np.arange(30) - 22) < 3, 0.1, np.inf)
+        d = np.asarray(bounded_minimum(*map(jnp.asarray, (A, g, y, (lower, upper))))) - y
+        slope, low, high = A @ d + g, y + d < lower + 1e-9, y + d > upper - 1e-9
+        assert np.all(y + d > lower - 1e-10) and np.all(y + d < upper + 1e-10)
+        assert np.abs(slope[~low & ~high]).max() < 1e-7
+        assert slope[low].min(initial=0) > -1e-7 and slope[high].max(initial=0) < 1e-7
 
 
-def test_bounded_step_reaches_the_optimum_where_the_normal_matrix_is_nearly_singular():
+def test_bounded_minimum_reaches_the_optimum_where_the_normal_matrix_is_nearly_singular():
     """Smooth columns, a tenth of them told apart: pivoting in blocks alone ends above its start, a fall that is none."""
     rng = np.random.default_rng(0)
     where = np.linspace(0, 1, 120)
@@ -198,10 +199,13 @@ def test_bounded_step_reaches_the_optimum_where_the_normal_matrix_is_nearly_sing
         A = columns.T @ columns
         g = A @ y - columns.T @ (rng.standard_normal(200) + 3)
         A = A + 1e-9 * np.diag(np.diag(A))
-        d = np.asarray(bounded_step(jnp.asarray(A), jnp.asarray(g), jnp.asarray(y), jnp.ones(120, bool)))
-        slope, at = (A @ d + g) / np.abs(g).max(), y + d < 1e-12
-        assert (y + d).min() > -1e-10 and g @ d + 0.5 * d @ A @ d < 0
-        assert np.abs(slope[~at]).max() < 1e-7 and slope[at].min(initial=0) > -1e-7
+        for upper in np.full(120, np.inf), np.full(120, 1.5):
+            y = np.minimum(y, upper)
+            d = np.asarray(bounded_minimum(*map(jnp.asarray, (A, g, y, (np.zeros(120), upper))))) - y
+            slope, low, high = (A @ d + g) / np.abs(g).max(), y + d < 1e-12, y + d > upper - 1e-12
+            assert (y + d).min() > -1e-10 and np.all(y + d < upper + 1e-10) and g @ d + 0.5 * d @ A @ d < 0
+            assert np.abs(slope[~low & ~high]).max() < 1e-7 and high.any() == np.isfinite(upper[0])
+            assert slope[low].min(initial=0) > -1e-7 and slope[high].max(initial=0) < 1e-7
 
 
 def test_solver_runs_behind_optimistix():
@@ -210,11 +214,10 @@ def test_solver_runs_behind_optimistix():
     def residual(y, args):
         return jnp.concatenate([jnp.exp(0.3 * y) - jnp.exp(0.3 * target), 0.01 * y])
 
-    nonnegative = jnp.asarray([True, True, False])
-    solution = optx.least_squares(residual, ProjectedLevenbergMarquardt(nonnegative, atol=1e-9), jnp.ones(3), max_steps=50)
-    assert float(solution.value[1]) == 0.0
+    bounds = jnp.asarray([0.0, 0.0, -jnp.inf]), jnp.asarray([jnp.inf, jnp.inf, 2.5])
+    solution = optx.least_squares(residual, ProjectedLevenbergMarquardt(bounds, atol=1e-9), jnp.ones(3), max_steps=50)
+    assert float(solution.value[1]) == 0.0 and float(solution.value[2]) == 2.5
     assert float(solution.value[0]) == pytest.approx(1.0, abs=0.01)
-    assert float(solution.value[2]) == pytest.approx(3.0, abs=0.01)
 
 
 def test_lines_need_no_whole_periods():
@@ -355,7 +358,7 @@ def test_a_bent_step_follows_the_valley(monkeypatch):
         return np.array([50 * (z[0] * z[1] - 1), z[0] - 3, 0.0])
 
     monkeypatch.setattr(module, "data_residual", residual)
-    problem = SimpleNamespace(layout=SimpleNamespace(nonnegative=np.array([False, False])))
+    problem = SimpleNamespace(layout=SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf))))
     z, damping = np.array([1.0, 1.0]), 1e-3
     J = np.array([[50 * z[1], 50 * z[0]], [1.0, 0.0], [0.0, 0.0]])
     r, normal = residual(problem, z), J.T @ J
@@ -363,9 +366,31 @@ def test_a_bent_step_follows_the_valley(monkeypatch):
     bent = module.bent_step(problem, z, new, r, J, normal, damping)
     straight_cost, bent_cost, cost = (float(np.sum(residual(problem, x) ** 2)) for x in (new, bent, z))
     assert straight_cost > 5 * cost and bent_cost < 0.75 * cost and bent[0] > 1.2
-    problem.layout.nonnegative = np.array([True, True])
+    problem.layout.bounds = np.zeros(2), np.full(2, np.inf)
     held = module.bent_step(problem, np.array([1.0, 0.1]), np.array([1.2, 0.0]), r, J, normal, damping)
     assert held[1] == 0.0  # what the step has put at its bound stays there
+
+
+def test_parameters_stay_between_their_bounds(monkeypatch):
+    """A share in 0 .. 1 that the data pull to 3, a power in -0.5 .. 0.5, a time constant without an upper end."""
+    from fitting import joint
+    from fitting.model import Layout
+
+    basis = SimpleNamespace(cells=np.ones((4, 1)), penalties=(), total=1.0, held=None)
+    ends = np.array([0.0, -0.5, 0.0, -np.inf]), np.array([1.0, 0.5, np.inf, np.inf])
+    layout = Layout.build(basis, "abcd", [0.0, 0.2, 2.0, 5.0], [0.5, 0.1, 1.0, 1.0], *ends, [False, False, True, False])
+    assert layout.bounds[0] == pytest.approx([0, -np.inf, 0, -7, -np.inf, -np.inf])
+    assert layout.bounds[1] == pytest.approx([np.inf, np.inf, 2, 3, np.inf, np.inf])
+    part = layout.without("a")[0]
+    assert part.bounds[1] == pytest.approx([np.inf, np.inf, 3, np.inf, np.inf])
+    wanted = np.array([9.0, 0.0, 6.0, -20.0, 0.7, -3.0])
+    mixed = np.eye(6) + 0.1
+    monkeypatch.setattr(joint, "data_residual", lambda problem, z: 10 * mixed @ (np.asarray(z) - wanted))
+    monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: 10 * mixed)
+    monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(6))
+    found = joint.solve(SimpleNamespace(layout=layout, data_count=6), np.zeros(6), np.ones(0), evidence=False)
+    assert [float(layout.value(name, found.z)) for name in "ab"] == pytest.approx([1.0, -0.5])
+    assert list(layout.inside(found.z)) == [True, True, False, False, True, True] and found.converged
 
 
 @pytest.mark.parametrize("most", [(4, 1.0, 5e-4), (99, 1.0, 5e-4)], ids=["as it is", "without the rule"])
@@ -381,7 +406,7 @@ def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
     monkeypatch.setattr(joint, "bent_step", lambda problem, z, new, *rest: new)
     monkeypatch.setattr(joint, "evidence_weights", lambda layout, z, normal, weights: weights)
     monkeypatch.setattr(joint, "AT_END", most)
-    problem = SimpleNamespace(layout=SimpleNamespace(nonnegative=np.zeros(2, bool)), data_count=1000)
+    problem = SimpleNamespace(layout=SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf))), data_count=1000)
     found = joint.solve(problem, np.asarray([2.0, 0.5]), np.ones(1))
     assert found.jacobians < 12 if most[0] == 4 else found.jacobians == 30
 

@@ -104,7 +104,8 @@ def profile_intervals(result, names=None, *, level: float = 0.95, executor=None,
     names = layout.names if names is None else full_names(names, layout.names)
     problem, weights = lean(result.problem), result.refined.weights
     centre = settle(problem, result.refined.z, weights)
-    spread = covariance(centre.jacobian.T @ centre.jacobian + prior_matrix(problem, weights), centre.z, layout.density_unknowns)
+    normal = centre.jacobian.T @ centre.jacobian + prior_matrix(problem, weights)
+    spread = covariance(normal, centre.z, layout, [layout.index(n) for n in names])
     known = result.actuator.parameters()
     bounds = {n: (known[n][1].low, known[n][1].high) for n in names}
     inputs = {

@@ -45,7 +45,7 @@ def settle(problem: Problem, z, weights, *, jacobian=None, jacobians: int = 4) -
 
     `jacobian`: of the data at a point nearby, (data, unknowns), to begin with; `jacobians`: how many more may be taken.
     """
-    bounded = jnp.asarray(problem.layout.nonnegative)
+    bounds = tuple(map(jnp.asarray, problem.layout.bounds))
     prior = prior_matrix(problem, weights)
     z = np.asarray(z, float)
     residual = data_residual(problem, z)
@@ -58,7 +58,7 @@ def settle(problem: Problem, z, weights, *, jacobian=None, jacobians: int = 4) -
         normal = jacobian.T @ jacobian + prior
         for step in range(CHORDS):
             gradient = jacobian.T @ residual + prior @ z
-            new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounded))
+            new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounds))
             trial = data_residual(problem, new)
             new_cost = cost_of(trial, new, prior)
             good, converged = _verdict(cost, new_cost, predicted)
@@ -78,17 +78,17 @@ def settle_each(problem: Problem, lines, z, weights, jacobian) -> list[Settled]:
     A batch takes its steps together, one simulation of all; where the Jacobian does not serve a draw it goes on by itself. A
     last batch is filled up, so that a draw's numbers do not depend on how many there are.
     """
-    bounded, prior = jnp.asarray(problem.layout.nonnegative), prior_matrix(problem, weights)
+    bounds, prior = tuple(map(jnp.asarray, problem.layout.bounds)), prior_matrix(problem, weights)
     normal = jacobian.T @ jacobian + prior
     ended = []
     for first in range(0, len(lines), BATCH):
         own = lines[first : first + BATCH]
         filled = np.concatenate([own, np.repeat(own[-1:], BATCH - len(own), axis=0)])
-        ended += _chords(problem, filled, np.tile(np.asarray(z, float), (BATCH, 1)), prior, normal, jacobian, bounded)[: len(own)]
+        ended += _chords(problem, filled, np.tile(np.asarray(z, float), (BATCH, 1)), prior, normal, jacobian, bounds)[: len(own)]
     return [s if s.converged else settle(with_lines(problem, row), s.z, weights) for s, row in zip(ended, lines, strict=True)]
 
 
-def _chords(problem, lines, z, prior, normal, jacobian, bounded):
+def _chords(problem, lines, z, prior, normal, jacobian, bounds):
     """Steps with one Jacobian, each draw until it has settled or a step has not kept its promise."""
     residual = np.array(data_residuals(problem, z, lines))
     cost = [cost_of(*both, prior) for both in zip(residual, z, strict=True)]
@@ -96,7 +96,7 @@ def _chords(problem, lines, z, prior, normal, jacobian, bounded):
     for _ in range(CHORDS):
         new, predicted = z.copy(), np.zeros(len(z))
         for k in np.flatnonzero(going):
-            new[k], predicted[k] = damped_step(normal, jacobian.T @ residual[k] + prior @ z[k], z[k], DAMPING, bounded)
+            new[k], predicted[k] = damped_step(normal, jacobian.T @ residual[k] + prior @ z[k], z[k], DAMPING, bounds)
         trial = data_residuals(problem, new, lines)
         for k in np.flatnonzero(going):
             new_cost = cost_of(trial[k], new[k], prior)

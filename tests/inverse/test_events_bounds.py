@@ -208,7 +208,7 @@ def test_errors_of_a_fit_in_the_static_bound():
     cells = np.tril(np.ones((25, 25))).reshape(-1, 1) * rng.random((625, 3))
     root = rng.standard_normal((4, 4))
     spread = root @ root.T + np.eye(4)
-    layout = SimpleNamespace(density_unknowns=3, cells=cells, total=2.0)
+    layout = SimpleNamespace(density_unknowns=3, cells=cells, total=2.0, inside=lambda z: z > 0)
     solution = SimpleNamespace(normal=np.linalg.inv(spread), z=np.ones(4))
     result = SimpleNamespace(problem=SimpleNamespace(layout=layout), solution=solution, actuator=act)
     errors = mass_errors(result)

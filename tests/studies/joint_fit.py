@@ -177,7 +177,7 @@ def _errors(found):
     true = {**{k: TRUTH[v] for k, v in NAMES.items()}, "coil.H_bias": TRUTH["H_bias"]}
     problem, z = found.problem, found.solution.z
     J = data_jacobian(problem, z)
-    bound = covariance(J.T @ J + prior_matrix(problem, found.solution.weights), z, problem.layout.density_unknowns)
+    bound = covariance(J.T @ J + prior_matrix(problem, found.solution.weights), z, problem.layout)
     off, stated, least = {}, {}, {}
     for name, value in true.items():
         k = problem.layout.index(name)
