@@ -271,6 +271,7 @@ def test_a_sensors_zero_is_adopted_where_it_scores_best_and_told_of_where_an_eff
     assert better[0] is base and better[2:] == (None, None)
 
 
+@pytest.mark.long
 def test_zeros_that_change_from_recording_to_recording_are_told(bench):
     rng = np.random.default_rng(8)
     runs = [

@@ -150,6 +150,7 @@ def test_noise_without_a_repeat_is_told_to_be_a_guess(recordings, bench):
     assert "1 of 2 recordings is a guess" in guessed([one, whole], bench) and not guessed([whole], bench)
 
 
+@pytest.mark.long
 def test_one_unknown_a_cell(recordings, bench):
     got = fit(recordings, bench, choices=dataclasses.replace(QUICK, knots=None, level=25), refine=False)
     assert abs(got.estimate("coil.R_eddy").value / 62 - 1) < 0.05

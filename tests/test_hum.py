@@ -42,6 +42,7 @@ def test_hum_scores_on_the_harmonics_that_it_falls_on():
     assert z > 15 and tones[0] == (50.0, pytest.approx(HUM, rel=0.3))
 
 
+@pytest.mark.long
 def test_what_one_recording_shows_alone_is_no_hum():
     """It would have the same size in all of them."""
     base = fit(recorded(2 * HUM, only=25), BENCH, refine=False)

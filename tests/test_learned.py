@@ -43,7 +43,10 @@ def reading(act, current=CURRENT):
     return run_chain(act, current, DT, 2, 4, "trapezoid").reading
 
 
-@pytest.mark.parametrize("place", [pytest.param(p, marks=[pytest.mark.long] if p == "hysteresis" else []) for p in PLACES])
+@pytest.mark.parametrize(
+    "place",
+    [pytest.param(p, marks=[pytest.mark.long] if p in ("hysteresis", "mechanics", "magnetostriction") else []) for p in PLACES],
+)
 def test_null_gradient_and_batch(place):
     act = actuator(20)
     extended = act.with_effect(term_at(place))

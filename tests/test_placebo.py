@@ -43,6 +43,7 @@ def final(runs):
     return fit(runs, "aa-050h", choices=QUICK, refine=False)
 
 
+@pytest.mark.long
 def test_silent_and_resumed(final, runs, tmp_path):
     found = placebo(final, runs, 2, checkpoint=tmp_path / "kept")
     assert found["procedure"] == "search" and (found["runs"], found["false_alarms"], found["named"]) == (2, 0, {})

@@ -112,6 +112,7 @@ def recordings_from(start, noise=40e-9, seed=0):
     return made, bench
 
 
+@pytest.mark.long
 def test_the_fit_finds_a_demagnetized_start():
     made, bench = recordings_from(1.23e4)
     found = fit(made, bench, refine=False)
@@ -123,7 +124,8 @@ def test_the_fit_finds_a_demagnetized_start():
 
 
 @pytest.mark.parametrize(("stated", "rest", "found", "told"), [
-    ("demagnetized", 0.0, "virgin", False), ("demagnetized", 1.23e4, "demagnetized", False), ("positive_saturation", 1.23e4, "demagnetized", True),
+    pytest.param("demagnetized", 0.0, "virgin", False, marks=pytest.mark.long), ("demagnetized", 1.23e4, "demagnetized", False),
+    pytest.param("positive_saturation", 1.23e4, "demagnetized", True, marks=pytest.mark.long),
 ])  # fmt: skip
 def test_a_start_that_the_bench_states(stated, rest, found, told):
     """A rod is demagnetized with its bias on or before; a start that the recordings contradict is told, and what they say is taken."""
