@@ -253,6 +253,29 @@ def test_slow_states_are_led_to_their_repeat(effect):
     assert np.abs(few - many).max() < 0.03 * np.abs(many - before).max()
 
 
+@pytest.mark.parametrize(("of_field", "shortest", "exponent"), [(0.0, 1e-5, 0.0), (0.0, 2e-3, 0.3), (1.0, 3e-4, -0.3)])
+def test_the_aftereffect_weighs_its_lags_by_a_power_of_time(of_field, shortest, exponent):
+    """What is late, against the ladder's response at each harmonic of the relays' magnetization or field."""
+    act, dt, share = actuator(20), DT / 4, 0.1
+    turn = jnp.arange(4 * N) / (4 * N)
+    fine = CURRENT.mean() + 0.4 * jnp.ptp(CURRENT) * jnp.sin(2 * jnp.pi * turn)
+    effect = effects.MagneticAftereffect(share=share, of_field=of_field, shortest=shortest, exponent=exponent)
+    found = run_chain(act.with_effect(effect), fine, dt, 5, 4)
+    times = 10.0 ** np.arange(-4, 0.1, 0.5)
+    weights = times**exponent / (1 + (shortest / times) ** 2)
+    s = 2j * np.pi * np.arange(len(fine) // 2 + 1)[:, None] / (len(fine) * dt)
+    gain = 1 + share * ((weights / (1 + s * times)).sum(1) / weights.sum() - 1)
+    H, M = np.asarray(found.field), np.asarray(found.magnetization)
+    if of_field:  # H = v + S (v - late v): the field that the relays see lies behind
+        late = np.fft.irfft(np.fft.rfft(H) / (2 - gain), len(fine))
+        relays = np.asarray(act.hysteresis.magnetization(jnp.tile(late, 2), corners=6))[len(fine) :]
+        error, effect_size = M - relays, np.asarray(act.hysteresis.magnetization(jnp.tile(H, 2), corners=6))[len(fine) :] - relays
+    else:
+        relays = np.asarray(act.hysteresis.magnetization(jnp.tile(found.field, 2), corners=6))[len(fine) :]
+        error, effect_size = M - np.fft.irfft(gain * np.fft.rfft(relays), len(fine)), M - relays
+    assert np.abs(error - error.mean()).max() < 0.02 * np.ptp(effect_size)
+
+
 def test_a_second_path_round_the_coil_filters_the_drive():
     kappa, tau = 0.05, 2e-3
     line = Timeline(jnp.asarray(DT), N, True)

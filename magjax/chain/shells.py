@@ -110,8 +110,8 @@ def march_of_shells(actuator, share, count: int, applied, current, h, memory, sc
 
 
 def _of_every_shell(states, count):
-    """States of effects, each (shells,): some do not differ between them."""
-    return jax.tree.map(lambda s: jnp.broadcast_to(jnp.asarray(s, float), (count,)), states)
+    """States of effects, the last axis of each the shells: some do not differ between them."""
+    return jax.tree.map(lambda s: jnp.broadcast_to(jnp.asarray(s, float), (*jnp.shape(s)[:-1], count)), states)
 
 
 def _relays(table, memory, v):

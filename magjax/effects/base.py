@@ -118,7 +118,7 @@ class AbstractEffect(eqx.Module):
         return current
 
     def start(self, trial: Trial, actuator):
-        """Internal state at equilibrium before the first step: any tuple of scalars."""
+        """Internal state at equilibrium before the first step: any tuple of scalars, or of arrays whose last axes are those of `trial.field`."""
         return ()
 
     def field_shift(self, trial: Trial, state, actuator):
