@@ -4,6 +4,7 @@ Reading files is in `readers`; this module holds the value and its judgements: f
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -80,6 +81,10 @@ class Recording:
 
     def frequency(self) -> float | None:
         """Fundamental of the drive, Hz; None where less than 0.9 of a period is recorded or nothing repeats."""
+        return self._frequency
+
+    @functools.cached_property
+    def _frequency(self) -> float | None:
         return fundamental(np.asarray(self.channels[self.drive], float), self.dt, self._header_frequency())
 
     def _header_frequency(self) -> float | None:

@@ -1,5 +1,7 @@
 """A recording's own judgements: period, noise from repeats, what is refused and what is not."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -113,3 +115,16 @@ def test_a_single_sample_is_told(tmp_path):
     path.write_text("time_s,current_A,displacement_m\n0,0.1,1e-5\n")
     with pytest.raises(RecordingError, match="one sample only"):
         load_recordings([path], load_bench("aa-050h"))
+
+
+def test_the_fundamental_is_looked_for_once(monkeypatch):
+    from magjax import recording as module
+
+    asked, look = [], module.fundamental
+    monkeypatch.setattr(module, "fundamental", lambda *given: asked.append(given) or look(*given))
+    time = np.arange(1000) * 1e-3
+    one = Recording(time, {"current": np.sin(2 * np.pi * 5 * time), "displacement": np.cos(2 * np.pi * 5 * time)})
+    assert one.frequency() == pytest.approx(5) and one.periods() == pytest.approx(5) and not one.noise_is_a_guess("displacement")
+    assert len(asked) == 1
+    other = dataclasses.replace(one, channels={**one.channels, "current": np.sin(2 * np.pi * 8 * time)})
+    assert other.frequency() == pytest.approx(8) and len(asked) == 2
