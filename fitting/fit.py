@@ -259,7 +259,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult
         + guessed(recordings, bench)
         + _contradicted(bench, choices)
     )
-    lost = not chi2n < LOST or (chi2n > AT_BOUND and any(e.at_bound for e in rows))
+    lost = not chi2n < LOST or (chi2n > AT_BOUND and any(e.at_bound and not e.name.startswith("effects.") for e in rows))
     return FitResult(
         fitted, bench, bool(solution.converged) and not lost, message, tuple(rows), related, per_recording, float(chi2n), count,
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
@@ -347,7 +347,7 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
             return f"{after}: no step leads on from there; start nearer, hold a parameter or give it a prior (see the bench file)"
         return f"{after}; raise --max-jacobians or start nearer (see the bench file)"
     worst = max(rows, key=lambda r: r.chi2_per_sample)
-    bound = [e.name for e in parameters if e.at_bound]
+    bound = [e.name for e in parameters if e.at_bound and not e.name.startswith("effects.")]  # where a law's shape ends it may stay
     if bound:
         far = f", and the residual is {np.sqrt(chi2n):.3g} times the noise (worst: {Path(worst.file).name})" if chi2n > 2 else ""
         return f"{', '.join(bound)} sits at its bound{far}; free another parameter or check signs, units and the bench file"

@@ -21,6 +21,8 @@ from .uncertainty import NO_PRIOR
 START_WEIGHTS = (1e2, 1e2, 1e2, 1e2)  # one a family of penalties; the last where there is a reversible part
 PLANE_MARGIN = 0.01
 EDDY_EFFECT = "effects.eddy_currents.k"
+SCANNED = ("coil.k_eddy", "piezo.chi")  # benches differ by decades: a scan finds where they begin
+REACH = 30.0  # times the bench's value, or that part of it: as far as a positive parameter may go
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,11 +159,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     infos = [known[n][1] for n in names]
     log = [i.low >= 0 and v > 0 and (i.null is None or i.shape) for i, v in zip(infos, values, strict=True)]
     scales = [i.scale for i in infos]
-    ends = [
-        (i.low if i.shape else -np.inf, i.high) if n.startswith("effects.") else (-np.inf, np.inf)
-        for n, i in zip(names, infos, strict=True)
-    ]
-    lows, highs = (np.asarray(x) for x in zip(*ends, strict=True)) if ends else (np.zeros(0), np.zeros(0))
+    lows, highs = _bounds(names, values, infos, log, bench)
     layout = Layout.build(basis, names, values, scales, lows, highs, log, memories)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
@@ -184,6 +182,24 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         template = template.remembering(bench.start)
     problem = Problem(layout, template, predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
+
+
+def _bounds(names, values, infos, log, bench):
+    """Lowest and highest value of each free parameter, SI, infinite where there is none.
+
+    The shapes of an effect keep their bounds; its amplitude is free in sign, so that one that is not there comes out as nothing.
+    A positive parameter of the plain chain stays within `REACH` of the bench's value: beyond (R_eddy without end, xi at nothing)
+    its logarithm has no slope left, and a fit that a missing effect has led there never comes back.
+    """
+    nominal = bench.actuator().parameters()
+    lows, highs = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    for k, (name, value, info) in enumerate(zip(names, values, infos, strict=True)):
+        if name.startswith("effects."):
+            lows[k], highs[k] = info.low if info.shape else -np.inf, info.high
+        elif log[k] and name not in SCANNED:
+            about = float(nominal[name][0])
+            lows[k], highs[k] = min(about / REACH, value), max(about * REACH, value)
+    return lows, highs
 
 
 def _quasistatic(bench) -> bool:

@@ -65,7 +65,9 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
             slope = layout.slope(name, solution.z)
             stderr = widen * abs(slope) * float(np.sqrt(max(cov[index, index], 0.0)))
             reach = max(abs(value), info.scale)
-            at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach)
+            at_bound = (
+                bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach) or not layout.inside(solution.z)[index]
+            )
             start = float(layout.starts[layout.names.index(name)])
             k = layout.names.index(name)
             gauge, prior = name in GAUGES and layout.density_unknowns > 0, float(np.asarray(problem.target.priors)[k])
