@@ -198,7 +198,9 @@ def _bounds(names, values, infos, log, bench):
             lows[k], highs[k] = info.low if info.shape else -np.inf, info.high
         elif log[k] and name not in SCANNED:
             about = float(nominal[name][0])
-            lows[k], highs[k] = min(about / REACH, value), max(about * REACH, value)
+            given_nearby = about > 0 and abs(np.log(value / about)) < np.log(REACH) + 1e-9
+            about = about if given_nearby else value
+            lows[k], highs[k] = about / REACH, about * REACH
     return lows, highs
 
 

@@ -123,6 +123,20 @@ def test_masses_that_are_not_free_are_held(recordings, bench, result):
         fit([beyond], held, actuator=off)
 
 
+def test_a_positive_parameter_stays_within_thirty_times_of_the_bench(recordings, bench, result):
+    layout = result.problem.layout
+    assert float(layout.highs[layout.names.index("coil.R_eddy")]) == pytest.approx(30 * bench.constants["coil.R_eddy"])
+    far = dataclasses.replace(bench, constants={**bench.constants, "coil.R_eddy": result.estimate("coil.R_eddy").value / 45})
+    found = fit(
+        recordings, far, actuator=result.actuator, start=result, spectra=result.spectra, choices=result.choices, refine=False
+    )
+    assert not found.estimate("coil.R_eddy").at_bound  # where it was given beyond, there it may stay
+    stuck = fit(recordings, far, choices=QUICK, refine=False)
+    resistance = stuck.estimate("coil.R_eddy")
+    assert resistance.value == pytest.approx(30 * far.constants["coil.R_eddy"]) and resistance.at_bound
+    assert "coil.R_eddy sits at its bound" in stuck.message
+
+
 def test_a_gauge_is_told_with_what_makes_up_for_it(recordings, bench, result):
     assert result.estimate("coil.R_eddy").identified and "not identified" not in result.message
     free = fit(recordings, bench, extra=("coil.H_bias",), choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
