@@ -186,6 +186,26 @@ def test_a_rod_that_sticks_stays_calm_on_a_coarse_grid():
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.04 * np.sqrt(np.mean(fine**2))
 
 
+@pytest.mark.parametrize("frequency", [10.7, 175.0])
+def test_strong_friction_of_a_little_damped_rod_is_settled(frequency, monkeypatch):
+    """The rod goes on swinging after each turn: a slow drive's samples are too few for it, a fast one's period too short."""
+    from magjax.effects import coulomb_friction as module
+
+    act = dataclasses.replace(actuator(20), mechanics=Mechanics(jnp.asarray(500.0), jnp.asarray(0.055)))
+    effect = effects.CoulombFriction(f=3.7e-6, v_s=1e-6, presliding=4e-7)
+
+    def lost(count):
+        line = Timeline(jnp.asarray(1 / (frequency * count)), count, True)
+        turn = 2 * jnp.pi * jnp.arange(count) / count
+        linear = line.filter(1.5e-5 * (jnp.sin(turn) + 0.3 * jnp.sin(2 * turn + 1)), act.mechanics.response)
+        return np.asarray(effect.displacement(linear, None, None, line, act) - linear)[:: count // 500]
+
+    found = lost(500)
+    monkeypatch.setattr(module, "PASSES", 16)
+    true = lost(8000)
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.005 * np.sqrt(np.mean(true**2))
+
+
 def test_creep_weighs_its_lags_by_a_power_of_time():
     line, signal = Timeline(jnp.asarray(1e-3), 200, True), jnp.sin(2 * jnp.pi * jnp.arange(200) / 200)  # 5 Hz
     s = 2j * np.pi * 5

@@ -1,5 +1,7 @@
 """mechanics: dry friction in guides and seals, with the presliding of its bristles."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -9,7 +11,8 @@ from .base import AbstractEffect
 
 STEEPEST = 50.0  # f over presliding, both m: a rod springs back by 2 f at a turn, so that a shorter way hardly shows
 NEWTON = 8  # steps to the displacement that a sample's friction allows; from the side where they only approach
-PASSES = 3  # over a period; each begins with the steady response to the friction of the one before
+PASSES = 7  # over a period; each begins with the steady response to the friction of the one before
+FINEST = 2000  # samples a period at least: after each turn the rod swings at its own frequency, far above a slow drive's
 
 
 def _turned(moved, p, law):
@@ -74,7 +77,18 @@ class CoulombFriction(AbstractEffect):
     amplitude = "f"
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
-        """Displacement with friction, m."""
+        """Displacement with friction, m; of a steady period on a grid of `FINEST` samples or more."""
+        if not line.periodic:
+            return self._with_friction(displacement, line, actuator)
+        times = -(-FINEST // line.count)
+        spectrum = jnp.fft.rfft(displacement)
+        if line.count % 2 == 0:  # what stands at the highest line is both of its sides
+            spectrum = spectrum.at[-1].multiply(0.5)
+        finer = dataclasses.replace(line, dt=line.dt / times, count=times * line.count)
+        between = times * jnp.fft.irfft(spectrum, finer.count)
+        return displacement + (self._with_friction(between, finer, actuator) - between)[::times]
+
+    def _with_friction(self, displacement, line, actuator):
         way = jnp.maximum(jnp.maximum(self.presliding, self.f / STEEPEST), 1e-10)
         slow = jnp.maximum(self.v_s, 1e-9) * line.dt  # m a sample
         mechanics = actuator.mechanics
