@@ -209,7 +209,7 @@ def solve(
     lead there the iteration ends.
     """
     layout, count = problem.layout, problem.data_count
-    bounds = tuple(map(jnp.asarray, layout.bounds))
+    bounds = layout.bounds
     z, weights = np.asarray(z, float), np.asarray(weights, float)
     prior = prior_matrix(problem, weights)
     begin, converged, interrupted, taken, damping, decrement, held = time.perf_counter(), False, False, 0, 1e-2, np.inf, np.inf

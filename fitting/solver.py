@@ -104,7 +104,7 @@ def padded_step(size: int):
         whole[:n, :n] = A
         ends = ((gradient, 0.0), (y, 0.0), (bounds[0], -1.0), (bounds[1], 1.0))
         gradient, y, lower, upper = (np.concatenate([x, np.full(size - n, v)]) for x, v in ends)
-        return (np.asarray(damped_step(whole, gradient, y, 0.0, (jnp.asarray(lower), jnp.asarray(upper)))[0]) - y)[:n]
+        return (np.asarray(damped_step(whole, gradient, y, 0.0, (lower, upper))[0]) - y)[:n]
 
     return step
 

@@ -57,7 +57,7 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
     layout = problem.layout
     cov = covariance(solution.normal, solution.z, layout)
     widen = WIDEN_BESIDE if actuator.effects else WIDEN
-    rows = []
+    inside, rows = layout.inside(solution.z), []
     for name, (value, info) in actuator.parameters().items():
         value = float(np.asarray(value))
         if name in layout.names:
@@ -65,9 +65,7 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
             slope = layout.slope(name, solution.z)
             stderr = widen * abs(slope) * float(np.sqrt(max(cov[index, index], 0.0)))
             reach = max(abs(value), info.scale)
-            at_bound = (
-                bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach) or not layout.inside(solution.z)[index]
-            )
+            at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach or not inside[index])
             start = float(layout.starts[layout.names.index(name)])
             k = layout.names.index(name)
             gauge, prior = name in GAUGES and layout.density_unknowns > 0, float(np.asarray(problem.target.priors)[k])

@@ -189,8 +189,9 @@ def _next_distance(below, above, root):
 
 
 def _coordinate_of_bound(layout, name, bounds, side):
-    """The optimiser's coordinate of the bound on that side, infinite where there is none."""
-    bound = bounds[0] if side < 0 else bounds[1]
-    if not np.isfinite(bound) or (layout.log[layout.names.index(name)] and bound <= 0):
-        return side * np.inf
-    return layout.coordinate(name, bound)
+    """The optimiser's coordinate of the bound on that side, the parameter's own or the fit's, infinite where there is none."""
+    bound, kept = (b[side > 0] for b in (bounds, layout.bounds))
+    kept = side * float(kept[layout.index(name)])
+    if np.isfinite(bound) and not (layout.log[layout.names.index(name)] and bound <= 0):
+        kept = min(kept, side * layout.coordinate(name, bound))
+    return side * kept

@@ -45,7 +45,7 @@ def settle(problem: Problem, z, weights, *, jacobian=None, jacobians: int = 4) -
 
     `jacobian`: of the data at a point nearby, (data, unknowns), to begin with; `jacobians`: how many more may be taken.
     """
-    bounds = tuple(map(jnp.asarray, problem.layout.bounds))
+    bounds = problem.layout.bounds
     prior = prior_matrix(problem, weights)
     z = np.asarray(z, float)
     residual = data_residual(problem, z)
@@ -78,7 +78,7 @@ def settle_each(problem: Problem, lines, z, weights, jacobian) -> list[Settled]:
     A batch takes its steps together, one simulation of all; where the Jacobian does not serve a draw it goes on by itself. A
     last batch is filled up, so that a draw's numbers do not depend on how many there are.
     """
-    bounds, prior = tuple(map(jnp.asarray, problem.layout.bounds)), prior_matrix(problem, weights)
+    bounds, prior = problem.layout.bounds, prior_matrix(problem, weights)
     normal = jacobian.T @ jacobian + prior
     ended = []
     for first in range(0, len(lines), BATCH):

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from ..param import param
 from .base import AbstractEffect
+from .lags import power_of_time
 
 LONGEST = 100.0  # s; slower creep is a rest that periodic recordings cannot show
 MIDDLE = 0.1  # s, where `gain` is per decade
@@ -24,17 +25,7 @@ class Creep(AbstractEffect):
     shortest: Float[Array, ""] = param(
         1e-3, "s", "time at which the creep begins", low=1e-5, scale=1e-3, shape=True, typical=(1e-4, 1e-1)
     )
-    exponent: Float[Array, ""] = param(
-        0.0,
-        "1",
-        "power of time: slow lags weigh more where it is positive",
-        low=-0.5,
-        high=0.5,
-        scale=0.1,
-        shape=True,
-        detail=True,
-        typical=(0.0, 0.3),
-    )
+    exponent: Float[Array, ""] = power_of_time((0.0, 0.3))
     mean_behind: Float[Array, ""] = param(
         0.0, "1", "decades of creep that the mean level has not taken yet", scale=2.0, shape=True, typical=(0.0, 5.0)
     )

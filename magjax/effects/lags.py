@@ -1,6 +1,14 @@
-"""Helpers for effects whose state lags behind a signal inside the implicit step."""
+"""Helpers for effects that lag behind a signal through a spread of times."""
 
 import jax.numpy as jnp
+
+from ..param import param
+
+
+def power_of_time(typical):
+    """The declared parameter by which a spread of lags leans; `typical`: its expected range."""
+    meaning = "power of time: slow lags weigh more where it is positive"
+    return param(0.0, "1", meaning, low=-0.5, high=0.5, scale=0.1, shape=True, detail=True, typical=typical)
 
 
 def lagged(state, before, now, h, tau):

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from ..param import param
 from .base import AbstractEffect
-from .lags import lagged, repeated
+from .lags import lagged, power_of_time, repeated
 
 TIMES = 10.0 ** np.arange(-4.0, 0.1, 0.5)  # s, two lags a decade make log time
 N = len(TIMES)
@@ -35,17 +35,7 @@ class MagneticAftereffect(AbstractEffect):
     shortest: Float[Array, ""] = param(
         3e-4, "s", "lag below which there is less and less", low=1e-6, scale=3e-4, shape=True, detail=True, typical=(1e-5, 1e-1)
     )
-    exponent: Float[Array, ""] = param(
-        0.0,
-        "1",
-        "power of time: slow lags weigh more where it is positive",
-        low=-0.5,
-        high=0.5,
-        scale=0.1,
-        shape=True,
-        detail=True,
-        typical=(-0.3, 0.3),
-    )
+    exponent: Float[Array, ""] = power_of_time((-0.3, 0.3))
 
     name = "magnetic_aftereffect"
     block = "hysteresis"
