@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.chain import Timeline
-from magjax.chain.coupled import disturbance_of, magnetize
+from magjax.chain.coupled import disturbance_of
+from magjax.chain.march import magnetize
 from magjax.effects.base import AbstractEffect
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain

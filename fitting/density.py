@@ -6,12 +6,20 @@ lets the level of M depend on a recording's highest and lowest field without ask
 """
 
 import dataclasses
+import functools
 
+import jax
 import numpy as np
 
 R_EXPONENT = 1.6
 TAIL = 0.5
 RIDGE = 0.3  # beside second differences
+
+
+def on_device(values):
+    """Numbers as a JAX array of floats or complex ones; `jnp.asarray` would compile a program for every new shape."""
+    values = np.asarray(values)
+    return jax.device_put(values if values.dtype.kind in "fc" else values.astype(float))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +42,22 @@ class DensityBasis:
     knots_r: int
     held: np.ndarray | None = None  # (size, size), A/m: masses that are there beside them, and stay
 
+    @functools.cached_property
+    def tables(self) -> np.ndarray:
+        """Everett values of every hat at total mass 1, as `magjax.preisach.everett` has them, (unknowns, size + 1, size + 1)."""
+        L = self.size
+        cube = np.ascontiguousarray(self.cells.T).reshape(-1, L, L)
+        values = np.zeros((len(cube), L + 1, L + 1))
+        values[:, 1:, :L] = np.cumsum(np.cumsum(cube, axis=1)[:, :, ::-1], axis=2)[:, :, ::-1]
+        k = np.arange(L)
+        values[:, k, k + 1] = cube[:, k, k]
+        return values
+
+    @functools.cached_property
+    def placed(self) -> tuple:
+        """Cells, tables and penalties as JAX arrays: every fit on this basis shares them."""
+        return on_device(self.cells), on_device(self.tables), tuple(on_device(D) for D in self.penalties)
+
     @property
     def unknowns(self) -> int:
         """How many unknowns the density has."""
@@ -44,6 +68,7 @@ class DensityBasis:
         return (self.total * (self.cells @ np.asarray(x))).reshape(self.size, self.size)
 
 
+@functools.lru_cache(maxsize=2)
 def hat_basis(
     low: float,
     high: float,
@@ -171,6 +196,7 @@ def held_basis(hysteresis, total: float) -> DensityBasis:
     return DensityBasis(float(hysteresis.low), float(hysteresis.high), len(masses), none, (), total, np.zeros(0), 0, 0, masses)
 
 
+@functools.lru_cache(maxsize=2)
 def cell_basis(low: float, high: float, total: float, level: int) -> DensityBasis:
     """One unknown a cell, the form of T&B Sec. 2.1, with the once-switching column; penalties along s and r."""
     size = level + 2

@@ -15,10 +15,11 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import structural_rank
 
+from magjax.preisach.everett import everett_table
 from magjax.programs import kept
 
 from .model import Layout, Predictor, Target, whitened
-from .solver import damped_step, pushed
+from .solver import CHUNK, damped_step, pushed
 
 WEIGHT_RANGE = (1e-3, 1e9)
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
@@ -96,8 +97,44 @@ def _march(layout, z, template, predictor):
 @kept
 def _march_tangents(layout, z, template, predictor):
     """Fields and magnetizations, and their change with each unknown, (unknowns, recordings, samples) per grid."""
-    marched, push = jax.linearize(lambda y: predictor.march(layout.actuator(template, y), layout.levels(y)), z)
-    return marched, pushed(push, jnp.eye(z.shape[0]))
+    if layout.held is not None:  # few unknowns, none of them the density's
+        marched, push = jax.linearize(lambda y: predictor.march(layout.actuator(template, y), layout.levels(y)), z)
+        return marched, pushed(push, jnp.eye(z.shape[0]))
+    n = layout.density_unknowns
+
+    def march(masses, values, rest):
+        y = jnp.concatenate([jax.lax.stop_gradient(z[:n]), rest])
+        return predictor.march(layout.actuator(template, y, (masses, values)), layout.levels(y))
+
+    masses = layout.masses(z)
+    values = everett_table(masses, 0.0, 1.0, 0.0).values
+    marched, push = jax.linearize(march, masses, values, z[n:])
+    return marched, _every_unknown(push, layout, masses.shape, z.shape[0] - n)
+
+
+def _every_unknown(push, layout, shape, others: int):
+    """A linear function of masses, Everett values and the `others` unknowns, for each unknown of the layout.
+
+    Each hat's masses and Everett values are known: no product with the unit vectors, no sums over the plane.
+    """
+    n = layout.density_unknowns
+    chunks = -(-n // CHUNK)
+    size = -(-n // chunks)
+    last = -(-others // size)
+    rest = jnp.zeros((last * size, others)).at[:others].set(jnp.eye(others)).reshape(last, size, others)
+
+    def of_chunk(k):
+        hats, at = k < chunks, jnp.minimum(k * size, n - size)
+        masses = jnp.where(hats, layout.total * jax.lax.dynamic_slice_in_dim(layout.cells, at, size, 1).T, 0.0)
+        values = jnp.where(hats, layout.total * jax.lax.dynamic_slice_in_dim(layout.tables, at, size), 0.0)
+        unit = jnp.where(hats, 0.0, rest[jnp.maximum(k - chunks, 0)])
+        return jax.vmap(push)(masses.reshape(size, *shape), values, unit)
+
+    rows = jax.lax.map(of_chunk, jnp.arange(chunks + last))
+    before = (chunks - 1) * size
+    # the last chunk of hats begins early, so as to end with them
+    order = np.concatenate([np.arange(before), chunks * size - n + np.arange(before, n), chunks * size + np.arange(others)])
+    return jax.tree.map(lambda r: r.reshape(-1, *r.shape[2:])[order], rows)
 
 
 @kept

@@ -17,15 +17,9 @@ from magjax.preisach import Preisach
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
-from .density import DensityBasis
+from .density import DensityBasis, on_device
 
 MEMORY = 3e-4  # of the total; prior deviation of each recording's level of M
-
-
-def on_device(values):
-    """Numbers as a JAX array of floats or complex ones; `jnp.asarray` would compile a program for every new shape."""
-    values = np.asarray(values)
-    return jax.device_put(values if values.dtype.kind in "fc" else values.astype(float))
 
 
 class Layout(eqx.Module):
@@ -40,6 +34,7 @@ class Layout(eqx.Module):
     """
 
     cells: jax.Array
+    tables: jax.Array  # Everett values of the cells of every unknown, (density unknowns, levels, levels)
     penalties: tuple[jax.Array, ...]
     total: jax.Array
     starts: jax.Array
@@ -55,7 +50,7 @@ class Layout(eqx.Module):
     def build(basis, names, starts, scales, lows, highs, log, memories: int = 0) -> "Layout":
         """From a density basis and the free parameters' names, start values, scales, bounds and coordinate kinds."""
         return Layout(
-            on_device(basis.cells), tuple(on_device(D) for D in basis.penalties), on_device(basis.total),
+            *basis.placed, on_device(basis.total),
             on_device(starts), on_device(scales), on_device(lows), on_device(highs), tuple(names), tuple(log), memories,
             None if basis.held is None else on_device(basis.held),
         )  # fmt: skip
@@ -127,14 +122,24 @@ class Layout(eqx.Module):
         """What each recording's start transient adds to M, A/m, (recordings,) or None."""
         return MEMORY * self.total * z[self.size - self.memories :] if self.memories else None
 
-    def actuator(self, template, z):
-        """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable)."""
-        n = self.density_unknowns
-        side = int(round(self.cells.shape[0] ** 0.5))
-        masses = (self.total * (self.cells @ z[:n])).reshape(side, side)
-        masses = masses if self.held is None else self.held
-        offset = self.total * z[n] + jnp.sum(masses)
+    def masses(self, z):
+        """The Preisach masses, A/m, (levels - 1, levels - 1)."""
+        if self.held is not None:
+            return self.held
+        side = self.tables.shape[1] - 1
+        return (self.total * (self.cells @ z[: self.density_unknowns])).reshape(side, side)
+
+    def actuator(self, template, z, plane=None):
+        """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable).
+
+        `plane`: masses and their Everett values, A/m, instead of those that z describes.
+        """
+        masses = self.masses(z) if plane is None else plane[0]
+        mass = jnp.sum(masses) if plane is None else plane[1][-1, 0]
+        offset = self.total * z[self.density_unknowns] + mass
         template = eqx.tree_at(lambda a: (a.hysteresis.masses, a.hysteresis.offset), template, (masses, offset))
+        if plane is not None:
+            template = eqx.tree_at(lambda a: a.hysteresis, template, template.hysteresis.with_values(plane[1], masses))
         values = {name: self.value(name, z) for name in self.names}
         return template.replace(values) if values else template
 

@@ -19,12 +19,9 @@ SIGNS = 50  # instants of a period at which the sign of M is sought
 def everett_rows(basis, alpha, beta) -> np.ndarray:
     """T(alpha, beta) of every basis function at total mass 1, (points, unknowns)."""
     L = basis.size
-    cube = basis.cells.reshape(L, L, -1)
-    values = np.zeros((L + 1, L + 1, cube.shape[2]))
-    values[1:, :L] = np.cumsum(np.cumsum(cube, axis=0)[:, ::-1], axis=1)[:, ::-1]
+    values = np.moveaxis(basis.tables, 0, -1)
     k = np.arange(L)
-    diagonal = cube[k, k]
-    values[k, k + 1] = diagonal
+    diagonal = values[k, k + 1]
     step = (basis.high - basis.low) / L
 
     def locate(field):

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .chain import Timeline
-from .chain.coupled import magnetize, march_of, period_change, run_until_steady
+from .chain.coupled import march_of, period_change, run_until_steady
+from .chain.march import magnetize
 from .constants import MU0
 from .errors import ConfigurationError
 from .extrema import nesting

@@ -10,7 +10,7 @@ import pytest
 
 import magjax.effects as effects
 from magjax.chain import BLOCKS, Timeline
-from magjax.chain.coupled import magnetize
+from magjax.chain.march import magnetize
 from magjax.chain.mechanics import Mechanics
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.simulate import run_chain, simulate

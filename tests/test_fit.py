@@ -14,7 +14,7 @@ import pytest
 import magjax.bench
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
-from fitting.density import cell_basis, hat_basis
+from fitting.density import DensityBasis, cell_basis, hat_basis
 from fitting.fit import finer_than, fit, guessed, loose
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
@@ -391,7 +391,7 @@ def test_parameters_stay_between_their_bounds(monkeypatch):
     from fitting import joint
     from fitting.model import Layout
 
-    basis = SimpleNamespace(cells=np.ones((4, 1)), penalties=(), total=1.0, held=None)
+    basis = DensityBasis(0.0, 1.0, 2, np.ones((4, 1)), (), 1.0, np.ones(1), 1, 1)
     ends = np.array([0.0, -0.5, 0.0, -np.inf]), np.array([1.0, 0.5, np.inf, np.inf])
     layout = Layout.build(basis, "abcd", [0.0, 0.2, 2.0, 5.0], [0.5, 0.1, 1.0, 1.0], *ends, [False, False, True, False])
     assert layout.bounds[0] == pytest.approx([0, -np.inf, 0, -7, -np.inf, -np.inf])

@@ -8,7 +8,7 @@ from scipy.integrate import dblquad
 from scipy.optimize import root
 
 import magjax.effects as effects
-from magjax.chain.coupled import magnetize
+from magjax.chain.march import magnetize
 from magjax.chain.shells import distribution, march_shells
 from magjax.constants import MU0
 from magjax.preisach.memory import apply_field

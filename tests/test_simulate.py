@@ -9,8 +9,13 @@ import pytest
 from magjax.actuator import Actuator
 from magjax.bench import load_bench
 from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics
+from magjax.chain.march import _march_all, _marched
+from magjax.effects.excess_loss import ExcessLoss
+from magjax.effects.magnetic_aftereffect import MagneticAftereffect
+from magjax.effects.stress_feedback import StressFeedback
 from magjax.errors import ConfigurationError
 from magjax.preisach import Preisach, gaussian_lorentzian_masses
+from magjax.preisach.memory import apply_field
 from magjax.simulate import run_chain, simulate, sweep
 from tests.oracle.slow import SlowPreisach, slow_trapezoid
 
@@ -81,6 +86,33 @@ def test_gradient_in_every_parameter():
         number = float(functional(values + STEP * unit) - functional(values - STEP * unit)) / (2 * STEP)
         assert forward == pytest.approx(number, rel=1e-7), name
         assert reverse == pytest.approx(forward, rel=1e-9), name
+
+
+@pytest.mark.parametrize("scheme", ["trapezoid", "bdf2"])
+@pytest.mark.parametrize("effects", [(), (ExcessLoss(k=20.0), StressFeedback(stiffness=2e7)), (MagneticAftereffect(share=0.2),)])
+def test_the_replay_has_the_derivatives_of_the_march(scheme, effects):
+    """In every number that goes in, with nested loops after a history, effects inside the step and a disturbance."""
+    act = actuator(12)
+    for effect in effects:
+        act = act.with_effect(effect)
+    rng = np.random.default_rng(3)
+    wave = np.tile(sine(60, 0.5, -0.1) + 0.25 * np.sin(6 * np.pi * np.arange(60) / 60), 2)
+    memory = act.hysteresis.memory(act.hysteresis.table(), 12)
+    memory = apply_field(act.hysteresis.table(), memory, jnp.asarray(2.2e4))
+    given = tuple(jnp.asarray(5.0 * rng.standard_normal(120)) for _ in range(3))
+    whole = (act, act.coil.applied_field(jnp.asarray(wave)), jnp.asarray(wave), jnp.asarray(2e-4), memory, given)
+    numbers, rest = eqx.partition(whole, lambda x: isinstance(x, jax.Array) and x.dtype == float)
+    directions = jax.tree.map(
+        lambda x: 1e-3 * jnp.asarray(rng.standard_normal(x.shape)) * (jnp.abs(x) + 1e-3 * jnp.max(jnp.abs(x), initial=0.0)), numbers
+    )
+    got, direct = (
+        jax.jit(lambda x, d, run=run: jax.jvp(lambda x: run(*eqx.combine(x, rest))[:4], (x,), (d,)))(numbers, directions)
+        for run in (lambda *x: _marched(scheme, 60, *x), lambda *x: _march_all(scheme, 60, *x))
+    )
+    for values, changes, value, change in zip(*got, *direct, strict=True):
+        assert np.asarray(values) == pytest.approx(np.asarray(value), abs=1e-7)
+        assert np.asarray(changes) == pytest.approx(np.asarray(change), rel=1e-9, abs=1e-9 * float(jnp.abs(change).max()) + 1e-9)
+    assert float(jnp.abs(direct[1][0]).max()) > 1.0
 
 
 def test_gradient_in_the_masses():

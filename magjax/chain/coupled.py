@@ -33,13 +33,12 @@ MOST_STEPS = 100  # each halves the bracket or the step
 
 
 class _Carry(eqx.Module):
-    memory: Memory
+    memory: object
     X0: jax.Array
     X_before: jax.Array
     H0: jax.Array
     applied0: jax.Array
     states: tuple
-    residual: jax.Array
     marks: tuple  # states of effects at the last end of a period
 
 
@@ -177,18 +176,6 @@ def _extra_terms(effects, states, actuator, trial, p, q):
     return p * shift + q * added + loss, shift, added
 
 
-def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid", disturbance=None, period: int = 0):
-    """March (4) from equilibrium: (field H, magnetization M, relay field, residual, overflow) over time.
-
-    `applied`: c0 I + H_bias, A/m, (time,); `current` the drive, for effects; `h`: step, s; `memory`: the start state.
-    The field H is that of (4); the relays see H less the shifts of hysteresis effects. `residual`: A/m, (time,).
-    `disturbance`: what is added at every step as an effect would, (field shift, magnetization, loss), A/m, (time,) each.
-    `period`: steps of a period where the drive repeats, else 0: at its ends slow states are led to where they repeat.
-    """
-    march = march_of(actuator, applied[0], current[0], h, memory, scheme, period)
-    return run_march(march, applied, current, disturbance, period)
-
-
 class March(NamedTuple):
     """A march ready to go: the state at the first sample, the row (H, M, relay field, residual) there, and one step."""
 
@@ -198,7 +185,7 @@ class March(NamedTuple):
 
 
 def march_of(actuator, applied, current, h, memory: Memory, scheme: str, period: int = 0) -> March:
-    """The march of (4) from equilibrium at `applied`, A/m, and `current`, both scalars; the rest as in `magnetize`."""
+    """The march of (4) from equilibrium at `applied`, A/m, and `current`, both scalars; the rest as in `march.magnetize`."""
     if scheme not in SCHEMES:
         raise ConfigurationError(f'scheme = "{scheme}" is unknown; write one of {", ".join(SCHEMES)}')
     for effect in actuator.effects:
@@ -207,22 +194,49 @@ def march_of(actuator, applied, current, h, memory: Memory, scheme: str, period:
 
             return march_of_shells(actuator, effect.share(), effect.shells, applied, current, h, memory, scheme, period)
     table = actuator.hysteresis.table()
+    law = _law(actuator, h, scheme, period)
+    carry, first = _at_rest(law, table, actuator, applied, current, h, memory)
+    p, q = law.p, law.q
+
+    def advance(c: _Carry, drive):
+        rhs, trial_at = law.posed(c, drive)
+        if law.effects:
+            v, m, rising, kept, extra = _solve_with_effects(table, c, law.effects, actuator, trial_at, p, q, rhs)
+        else:
+            v, m, rising, kept = solve_branch(table, c.memory, p, q, rhs)
+            extra = (0.0, 0.0, 0.0)
+        residual = p * v + q * m + extra[0] - rhs
+        if law.effects:  # the relays' own M at that field, so that a step that did not settle shows
+            own, _, threshold, m_there = c.memory.branch(table, v)
+            residual = residual + (branch_magnetization(table, own, threshold, m_there, v) - m)
+        return law.after(c, drive, trial_at, v, m, extra, c.memory.move(rising, kept, v, m), residual)
+
+    return March(carry, first, advance)
+
+
+class _Law(NamedTuple):
+    """One step of (4) apart from how it is solved: p v + q M + extra = rhs.
+
+    `posed(carry, drive)`: (rhs, trial_at); `extra(states, trial)`: see `_extra_terms`; `after(carry, drive, trial_at, v, m,
+    extra, memory, residual)`: (next carry, row).
+    """
+
+    effects: tuple
+    p: jax.Array
+    q: jax.Array
+    extra: object
+    posed: object
+    after: object
+
+
+def _law(actuator, h, scheme, period) -> _Law:
     effects = tuple(e for e in actuator.effects if e.in_step)
     a = MU0 * actuator.coil.loss / h
     bdf = scheme == "bdf2"
     p, q = (1 + 1.5 * a, 1.5 * a) if bdf else (0.5 + a, a)
 
-    memory = apply_field(table, memory, applied)
-    zero = jnp.zeros_like(memory.field)
-    rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
-    states = tuple(e.start(rest, actuator) for e in effects)
-    _, shift, added = _extra_terms(effects, states, actuator, rest, p, q)
-    first = memory.field + shift
-    X = first + memory.magnetization + added
-    carry = _Carry(memory, X, X, first, applied, states, zero, states)
-
-    def advance(c: _Carry, drive):
-        applied1, current1, end, *given = drive
+    def posed(c, drive):
+        applied1, current1, _, *given = drive
         old = a * (2 * c.X0 - 0.5 * c.X_before) if bdf else a * c.X0 - 0.5 * c.H0 + 0.5 * c.applied0
         rhs = old + (applied1 if bdf else 0.5 * applied1)
         if given:
@@ -233,25 +247,34 @@ def march_of(actuator, applied, current, h, memory: Memory, scheme: str, period:
             change = (1.5 * X1 - 2 * c.X0 + 0.5 * c.X_before) if bdf else X1 - c.X0
             return Trial(v, m, MU0 * change / h, (v - c.memory.field) / h, current1, h)
 
-        if effects:
-            v, m, rising, kept, extra = _solve_with_effects(table, c, effects, actuator, trial_at, p, q, rhs)
-        else:
-            v, m, rising, kept = solve_branch(table, c.memory, p, q, rhs)
-            extra = (0.0, 0.0, 0.0)
-        memory = c.memory.move(rising, kept, v, m)
+        return rhs, trial_at
+
+    def extra(states, trial):
+        return _extra_terms(effects, states, actuator, trial, p, q)
+
+    def after(c, drive, trial_at, v, m, added, memory, residual):
+        applied1, _, end, *given = drive
         trial = trial_at(v, m)
         states = tuple(e.advance(trial, s, actuator) for e, s in zip(effects, c.states, strict=True))
-        H, M = v + extra[1], m + extra[2]
+        H, M = v + added[1], m + added[2]
         if given:
             H, M = H + given[0], M + given[1]
-        residual = p * v + q * m + extra[0] - rhs
-        if effects:  # the relays' own M at that field, so that a step that did not settle shows
-            own, _, threshold, m_there = c.memory.branch(table, v)
-            residual = residual + (branch_magnetization(table, own, threshold, m_there, v) - m)
         states, marks = _settle(effects, states, c.marks, end, period * h)
-        return _Carry(memory, H + M, c.X0, H, applied1, states, residual, marks), (H, M, v, residual)
+        return _Carry(memory, H + M, c.X0, H, applied1, states, marks), (H, M, v, residual)
 
-    return March(carry, (first, rest.magnetization + added, rest.field, zero), advance)
+    return _Law(effects, p, q, extra, posed, after)
+
+
+def _at_rest(law: _Law, table, actuator, applied, current, h, memory: Memory):
+    """The state at the first sample, at equilibrium, and the row (H, M, relay field, residual) there."""
+    memory = apply_field(table, memory, applied)
+    zero = jnp.zeros_like(memory.field)
+    rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
+    states = tuple(e.start(rest, actuator) for e in law.effects)
+    _, shift, added = law.extra(states, rest)
+    H, M = memory.field + shift, memory.magnetization + added
+    X = H + memory.magnetization + added
+    return _Carry(memory, X, X, H, applied, states, states), (H, M, memory.field, zero)
 
 
 def run_march(march: March, applied, current, disturbance=None, period: int = 0):
@@ -317,7 +340,7 @@ def _settle(effects, states, marks, end, duration):
 
 
 def disturbance_of(effect, actuator, field, magnetization, current, h, period: int = 0):
-    """What an effect would add at every step of a trajectory that it does not change: see `magnetize`.
+    """What an effect would add at every step of a trajectory that it does not change: see `march.magnetize`.
 
     `field`, `magnetization`: A/m, `current`: A, all (time,), of a march with the actuator's own coil; `period` as there.
     """

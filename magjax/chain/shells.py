@@ -55,7 +55,7 @@ class _Carry(eqx.Module):
 
 
 def march_shells(actuator, share, count: int, applied, current, h, memory, scheme: str, disturbance=None, period: int = 0):
-    """`coupled.magnetize` for a rod of `count` shells, of whose loss a `share` is distributed as in a solid cylinder."""
+    """`march.magnetize` for a rod of `count` shells, of whose loss a `share` is distributed as in a solid cylinder."""
     march = march_of_shells(actuator, share, count, applied[0], current[0], h, memory, scheme, period)
     return run_march(march, applied, current, disturbance, period)
 

@@ -72,5 +72,10 @@ def everett_table(masses: Float[Array, "L L"], low, high, offset) -> EverettTabl
     diagonal = jnp.diagonal(masses)
     above = jnp.arange(cells)
     values = values.at[above, above + 1].set(diagonal)
-    step = (high - low) / cells
-    return EverettTable(values, diagonal, low, step, both[-1, 0], offset)
+    return table_of(values, low, high, offset)
+
+
+def table_of(values: Float[Array, "levels levels"], low, high, offset) -> EverettTable:
+    """The table with these values at the levels, the diagonal masses above its diagonal."""
+    step = (high - low) / (values.shape[0] - 1)
+    return EverettTable(values, jnp.diagonal(values, 1), low, step, values[-1, 0], offset)

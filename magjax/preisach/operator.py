@@ -10,11 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from ..errors import ConfigurationError
 from ..param import as_float_array
-from .everett import everett_table
+from .everett import everett_table, table_of
 from .memory import apply_field, memory_after, start_history
 from .relays import relay_magnetization
 
@@ -50,6 +51,7 @@ class Preisach(eqx.Module):
     offset: Float[Array, ""]
     rest: Float[Array, ""]
     history: Float[Array, " extrema"]
+    values: Float[Array, "levels levels"] | None
 
     def __init__(self, masses, low, high, offset=0.0, start="negative_saturation", rest=None):
         masses = as_float_array(masses)
@@ -65,6 +67,7 @@ class Preisach(eqx.Module):
         self.low, self.high, self.offset = as_float_array(low), as_float_array(high), as_float_array(offset)
         self.rest = self.low if rest is None else as_float_array(rest)
         self.history = as_float_array(start_history(start, float(low), float(high)))
+        self.values = None
 
     @property
     def cells(self) -> int:
@@ -78,11 +81,21 @@ class Preisach(eqx.Module):
 
     def unreached(self, highest, lowest):
         """What M gains over a start in negative saturation by relays that a drive between two fields leaves up, A/m."""
-        step = (self.high - self.low) / self.cells
-        edge = (self.levels - self.rest) / step
-        share = unreached_share(edge, (highest - self.rest) / step, (lowest - self.rest) / step, jnp)
-        density = jnp.tril(self.masses) * (1.0 + jnp.eye(self.cells))  # a diagonal cell is half a square
-        return jnp.where(self.rest > self.low, 2 * jnp.sum(density * share), 0.0)
+
+        def gained(operator, highest, lowest):
+            step = (operator.high - operator.low) / operator.cells
+            edge = (operator.levels - operator.rest) / step
+            share = unreached_share(edge, (highest - operator.rest) / step, (lowest - operator.rest) / step, jnp)
+            density = jnp.tril(operator.masses) * (1.0 + jnp.eye(operator.cells))  # a diagonal cell is half a square
+            return 2 * (density.ravel() @ share.ravel())
+
+        # the slopes by the two fields once, not over the plane for every direction of a derivative
+        operator, *ends = stop_gradient((self, highest, lowest))
+        found = gained(self, *ends)
+        for k, (live, end) in enumerate(zip((highest, lowest), ends, strict=True)):
+            slope = jax.jvp(lambda x, k=k: gained(operator, *ends[:k], x, *ends[k + 1 :]), (end,), (jnp.ones_like(end),))[1]
+            found = found + slope * (live - end)
+        return jnp.where(self.rest > self.low, found, 0.0)
 
     def rested(self, alternations: int = 24) -> "Preisach":
         """The same operator with `rest` written out as a decaying history, for runs that are not periodic."""
@@ -99,7 +112,13 @@ class Preisach(eqx.Module):
 
     def table(self):
         """The Everett table that steps read."""
-        return everett_table(self.masses, self.low, self.high, self.offset)
+        if self.values is None:
+            return everett_table(self.masses, self.low, self.high, self.offset)
+        return table_of(self.values, self.low, self.high, self.offset)
+
+    def with_values(self, values: Float[Array, "levels levels"], masses) -> "Preisach":
+        """The same operator with other masses whose Everett `values` at the levels are known, A/m: a fit knows those of its basis."""
+        return eqx.tree_at(lambda h: (h.masses, h.values), self, (masses, values), is_leaf=lambda x: x is None)
 
     def memory(self, table, corners: int):
         """The memory at the start, with room for `corners` pairs at least."""
