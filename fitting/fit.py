@@ -15,7 +15,7 @@ from magjax.simulate import require_x64
 from .floors import swapped
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
-from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of, with_held_masses
+from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, field_of_rest, free_parameters, spectra_of, with_held_masses
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
@@ -76,7 +76,8 @@ def fit(
     problem, z = build_problem(
         spectra, actuator, bench, names, dataclasses.replace(choices, rest=rests_of(bench, choices)[0][0]), _density(start)
     )
-    data_residual(problem, z), data_jacobian(problem, z)  # compiles both
+    # compiles both, one while Python traces the other
+    together([lambda _: data_residual(problem, z), lambda _: data_jacobian(problem, z)])
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
     if refine and choices.knots is not None and not solution.interrupted:
@@ -157,7 +158,7 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
     ended = [run(rests[0], (problem, z))(report)]
     if not serves(*ended[0][:2])[0] and not ended[0][1].interrupted:
         try:
-            ended += together([run(rest) for rest in (*rests[1:], *others)], report)
+            ended += together([run(rest) for rest in _apart((*rests, *others), problem)[1:]], report)
         except KeyboardInterrupt:
             known, found, tried = ended[0]
             ended = [(known, dataclasses.replace(found, converged=False, interrupted=True), tried)]
@@ -171,6 +172,13 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
         if settled:
             break
     return best[:3]
+
+
+def _apart(rests, problem):
+    """Those that are not the same as one before: where the bias is strong, what was demagnetized without it is saturated."""
+    plane = problem.template.hysteresis
+    fields = [field_of_rest(rest, problem.template, float(plane.low), float(plane.high)) for rest in rests]
+    return [rest for k, rest in enumerate(rests) if fields[k] not in fields[:k]]
 
 
 def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report, highest):

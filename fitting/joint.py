@@ -159,6 +159,15 @@ def data_residual(problem: Problem, z):
     return np.asarray(_read_residual(problem.layout, jnp.asarray(z), problem.target, problem.template, predictor, marched))
 
 
+def fields(problem: Problem, z) -> list:
+    """Drive, field H and magnetization M of every recording over a period of the fine grid, as fitted: [(drive, H, M)], (samples,)."""
+    predictor, z = problem.predictors[1], np.asarray(z, float)
+    layout, template, place = problem.marching
+    marched = _march(layout, jnp.asarray(z[place]), template, predictor)
+    rows = [row for drives, (H, M) in zip(predictor.drives, marched, strict=True) for row in zip(drives, H, M, strict=True)]
+    return [tuple(np.asarray(x) for x in rows[k]) for k in predictor.index]
+
+
 @kept
 def _read_residuals(layout, z, lines, target, template, predictor):
     actuators, levels = jax.vmap(lambda y: (layout.actuator(template, y), layout.levels(y)))(z)
@@ -261,7 +270,7 @@ def solve(
             normal, gradient = information + prior, J.T @ residual + prior @ z
             good = False
             for _ in range(8):
-                new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounds))
+                new, predicted = damped_step(normal, gradient, z, damping, bounds)
                 trial = data_residual(problem, new)
                 new_cost = cost_of(trial, new, prior)
                 ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0

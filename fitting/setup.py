@@ -12,7 +12,6 @@ from magjax.recording import NO_ANSWER, follows_nothing
 from .density import cell_basis, hat_basis, held_basis
 from .joint import Problem
 from .model import Layout, Predictor, Target, make_start_actuator, on_device
-from .solver import padded_step
 from .spectra import HARMONICS, gain_rows, line_deviations, reduce_recording, with_noise
 from .starts import equation_error_start, scan_loss
 from .transients import unsettled_starts
@@ -132,27 +131,24 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         crowd = 1.7 if bench.drive == "field" else 1.0
         level = 2 * choices.level if known_field else choices.level
         basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive != "current")
-    zero = float(in_numpy(actuator.coil).applied_field(0.0))
-    about = {"demagnetized": zero, "virgin": 0.0, "positive": basis.high}.get(choices.rest, basis.low)
-    rest = float(np.clip(about, basis.low, basis.high))
+    rest = field_of_rest(choices.rest, actuator, basis.low, basis.high)
     harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
     deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
     full = [line_deviations(s, s.noise) for s in spectra]
     memories = len(spectra) if actuator.output == "displacement" else 0
-    solve = padded_step(basis.cells.shape[1] + 1 + len(names) + memories)
     starter = actuator  # its coil holds all of the eddy loss, for the equation error
     for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" and start is None and not held else ():
         # field-driven benches differ by decades: find the scale first
-        found = scan_loss(basis, spectra, full, actuator, solve, "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
+        found = scan_loss(basis, spectra, full, actuator, "coil.k_eddy", np.geomspace(1e-3, 30.0, 19))
         actuator, starter = actuator.replace({loss: found}), actuator.replace({"coil.k_eddy": found})
     if "piezo.chi" in names and start is None and not held:
         steepest = float(actuator.piezo.V_m) * max(s.peak_to_peak for s in spectra) / ((high - low) * _full_scale(actuator))
-        found = scan_loss(basis, spectra, full, actuator, solve, "piezo.chi", steepest * np.linspace(0.2, 1.1, 10))
+        found = scan_loss(basis, spectra, full, actuator, "piezo.chi", steepest * np.linspace(0.2, 1.1, 10))
         actuator = starter = actuator.replace({"piezo.chi": found})
     if held:
         start = np.asarray([(actuator.hysteresis.offset - actuator.hysteresis.masses.sum()) / total])
     elif start is None or len(start) != basis.cells.shape[1] + 1:
-        x, bottom, _ = equation_error_start(basis, spectra, full, starter, solve, rest=rest)
+        x, bottom, _ = equation_error_start(basis, spectra, full, starter, rest=rest)
         start = np.append(x, bottom)
     known = actuator.parameters()
     values = [float(known[n][0]) for n in names]
@@ -182,6 +178,12 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         template = template.remembering(bench.start)
     problem = Problem(layout, template, predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
+
+
+def field_of_rest(name: str, actuator, low: float, high: float) -> float:
+    """The field about which a start memory of that name was demagnetized, A/m, on a plane from `low` to `high`."""
+    zero = float(in_numpy(actuator.coil).applied_field(0.0))
+    return float(np.clip({"demagnetized": zero, "virgin": 0.0, "positive": high}.get(name, low), low, high))
 
 
 def _bounds(names, values, infos, log, bench):

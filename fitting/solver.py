@@ -1,8 +1,9 @@
 """Projected Levenberg-Marquardt for bounded, scaled least squares, behind optimistix's interface.
 
-optimistix brings no bounds and one Jacobian a trial; here bounds (a pair of arrays, lower and upper, infinite where there is
-none) are kept by block pivoting on the normal equations, the Jacobian is built in chunks of columns by `linearize`, may come from a coarser grid than the
-residual (`options["jacobian_fn"]`), and one step is one Jacobian with as many trial dampings as it needs.
+optimistix brings no bounds and one Jacobian a trial; here bounds (a pair of arrays, lower and upper, infinite where there
+is none) are kept by block pivoting on the normal equations, the Jacobian is built in chunks of columns by `linearize`, may
+come from a coarser grid than the residual (`options["jacobian_fn"]`), and one step is one Jacobian with as many trial
+dampings as it needs.
 """
 
 from typing import Any
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array
+from scipy.linalg import cho_factor, cho_solve
 
 CHUNK = 40
 
@@ -58,7 +60,7 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         def attempt(carry):
             damping, _, _, _, tried = carry
-            new, predicted = damped_step(normal, gradient, y, damping, self.bounds)
+            new, predicted = _called_back(normal, gradient, y, damping, self.bounds)
             new_cost = 0.5 * jnp.sum(fn(new, args)[0] ** 2)
             ratio = (cost - new_cost) / jnp.maximum(predicted, 1e-300)
             good = (ratio > 1e-3) & jnp.isfinite(new_cost)
@@ -67,7 +69,7 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         start = (state.damping, y, cost, jnp.asarray(False), jnp.asarray(0))
         damping, new, new_cost, good, _ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < self.trials), attempt, start)
-        _, decrement = damped_step(normal, gradient, y, 1e-9, self.bounds)
+        _, decrement = _called_back(normal, gradient, y, jnp.asarray(1e-9), self.bounds)
         fallen = cost - new_cost
         tolerance = self.atol + self.rtol * new_cost
         done = (decrement < tolerance) | ~good
@@ -85,28 +87,25 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return y, aux, {"decrement": state.decrement, "normal": state.normal}
 
 
-@jax.jit
 def damped_step(normal, gradient, y, damping, bounds):
-    """The bounded step under a damping relative to the diagonal: (new point, predicted fall of half chi2)."""
-    scale = jnp.diagonal(normal)
-    scale = scale + 1e-12 * jnp.max(scale)
-    new = bounded_minimum(normal + jnp.diag(damping * scale), gradient, y, bounds)
+    """The bounded step under a damping relative to the diagonal: (new point, predicted fall of half chi2). In NumPy: nothing to compile."""
+    scale = np.diagonal(normal)
+    scale = scale + 1e-12 * np.max(scale)
+    new = bounded_minimum(normal + np.diag(damping * scale), gradient, y, bounds)
     delta = new - y
     return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
 
 
-def padded_step(size: int):
-    """A bounded step for systems of up to `size` unknowns through the program that the fit's own steps of that size run."""
+def _called_back(normal, gradient, y, damping, bounds):
+    """`damped_step` within a compiled program."""
+    shapes = jax.ShapeDtypeStruct(y.shape, y.dtype), jax.ShapeDtypeStruct((), y.dtype)
+    return jax.pure_callback(_with_arrays, shapes, normal, gradient, y, damping, *bounds)
 
-    def step(A, gradient, y, bounds):
-        n = len(gradient)
-        whole = np.eye(size)
-        whole[:n, :n] = A
-        ends = ((gradient, 0.0), (y, 0.0), (bounds[0], -1.0), (bounds[1], 1.0))
-        gradient, y, lower, upper = (np.concatenate([x, np.full(size - n, v)]) for x, v in ends)
-        return (np.asarray(damped_step(whole, gradient, y, 0.0, (lower, upper))[0]) - y)[:n]
 
-    return step
+def _with_arrays(*given):
+    *first, lower, upper = (np.asarray(x) for x in given)
+    new, predicted = damped_step(*first, (lower, upper))
+    return new, np.asarray(predicted)
 
 
 def jacobian(fn, y):
@@ -133,60 +132,65 @@ def normal_equations(fn, y, residual):
     return J.T @ J, J.T @ residual
 
 
-def bounded_minimum(A, gradient, y, bounds, rounds: int = 25):
+def bounded_minimum(A, gradient, y, bounds, rounds: int = 25) -> np.ndarray:
     """The point between `bounds` where gradient'd + d'A d/2 is least, d counted from y; what ends at a bound is there exactly.
 
     Block principal pivoting on the free set, quick but without a promise; where it has not ended after `rounds`
     (a nearly singular A) a feasible active set, which falls at every step, goes on to the optimum.
     """
-    scale = 1 / jnp.sqrt(jnp.maximum(jnp.diagonal(A), 1e-300))
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(A), 1e-300))
     A = A * scale[:, None] * scale[None, :]
     g = gradient * scale
     walls = tuple((bound - y) / scale for bound in bounds)
     d, ended = _pivoted(A, g, walls, rounds)
-    d = _descended(A, g, walls, d, ended)
-    return jnp.where(d <= walls[0], bounds[0], jnp.where(d >= walls[1], bounds[1], jnp.clip(y + d * scale, *bounds)))
+    if not ended:
+        d = _descended(A, g, walls, d)
+    return np.where(d <= walls[0], bounds[0], np.where(d >= walls[1], bounds[1], np.clip(y + d * scale, *bounds)))
 
 
 def _minimum(A, g, fixed, at):
     """The minimum over the free unknowns, the `fixed` ones held where `at` says."""
-    n = len(g)
-    held = jnp.where(fixed, at, 0.0)
-    free = ~fixed
-    masked = jnp.where(free[:, None] & free[None, :], A, jnp.eye(n))
-    factor = jax.scipy.linalg.cho_factor(masked + 1e-13 * jnp.eye(n), lower=True)
-    return jnp.where(free, jax.scipy.linalg.cho_solve(factor, jnp.where(free, -(g + A @ held), 0.0)), held)
+    free = np.flatnonzero(~fixed)
+    found = np.where(fixed, at, 0.0)
+    if not len(free):
+        return found
+    inner = A[np.ix_(free, free)]
+    inner.flat[:: len(free) + 1] += 1e-13
+    try:
+        found[free] = -cho_solve(cho_factor(inner, lower=True, check_finite=False), (g + A @ found)[free], check_finite=False)
+    except np.linalg.LinAlgError:  # NaN, or not positive: no step, and the caller sees that it did not end well
+        found[free] = np.nan
+    return found
 
 
 def _pivoted(A, g, walls, rounds):
     """Block principal pivoting between the walls, (lowest, highest) step: (step, whether it is the optimum)."""
-    n = len(g)
-    floor, ceiling = (jnp.clip(wall, -1e300, 1e300) for wall in walls)
-
-    def pivot(carry):
-        side, _, best, count, k = carry  # -1 at the floor, 1 at the ceiling, 0 free
-        d = _minimum(A, g, side != 0, jnp.where(side < 0, floor, ceiling))
-        inward = side * (g + A @ d) > 1e-12
-        proper = jnp.where(side != 0, jnp.where(inward, 0, side), (d > ceiling + 1e-12) * 1 - (d < floor - 1e-12) * 1)
-        bad = proper != side
-        number = jnp.sum(bad)
-        # Murty's single exchange once the block exchange stops making progress
-        worst = jnp.arange(n) == (n - 1 - jnp.argmax(bad[::-1]))
-        stuck = (number >= best) & (count >= 3)
-        side = jnp.where(stuck & ~worst, side, proper)
-        return side, d, jnp.minimum(best, number), jnp.where(number < best, 0, count + 1), k + 1
-
+    floor, ceiling = (np.clip(wall, -1e300, 1e300) for wall in walls)
+    # -1 at the floor, 1 at the ceiling, 0 free
     side = ((ceiling <= 0) & (g < 0)) * 1 - ((floor >= 0) & (g > 0)) * 1
-    start = (side, jnp.zeros(n), jnp.asarray(n + 1), jnp.asarray(0), jnp.asarray(0))
-    _, d, left, *_ = jax.lax.while_loop(lambda c: (c[2] > 0) & (c[4] < rounds), pivot, start)
-    return jnp.clip(d, floor, ceiling), left == 0
+    best, count, number = len(g) + 1, 0, 0
+    for _ in range(rounds):
+        d = _minimum(A, g, side != 0, np.where(side < 0, floor, ceiling))
+        inward = side * (g + A @ d) > 1e-12
+        proper = np.where(side != 0, np.where(inward, 0, side), (d > ceiling + 1e-12) * 1 - (d < floor - 1e-12) * 1)
+        bad = np.flatnonzero(proper != side)
+        number = len(bad)
+        if not number:
+            break
+        if number >= best and count >= 3:
+            # Murty's single exchange once the block exchange stops making progress
+            side[bad[-1]] = proper[bad[-1]]
+        else:
+            side = proper
+        best, count = min(best, number), 0 if number < best else count + 1
+    return np.clip(d, floor, ceiling), not number
 
 
-def _descended(A, g, walls, d, ended, most: int = 400):
+def _descended(A, g, walls, d, most: int = 400):
     """The feasible active set from `d`, or from 0 where that is lower: unknowns that a step drives past a wall are fixed
     there (all of them where that falls further than to the first of them), and freed again at the minimum of the rest."""
     floor, ceiling = walls
-    tolerance = 1e-11 * jnp.max(jnp.abs(g))
+    tolerance = 1e-11 * np.max(np.abs(g))
 
     def height(x):
         return g @ x + 0.5 * x @ A @ x
@@ -194,28 +198,27 @@ def _descended(A, g, walls, d, ended, most: int = 400):
     def outward(x, slope):
         return ((x <= floor) & (slope > 0)) | ((x >= ceiling) & (slope < 0))
 
-    def onward(carry):
-        d, fixed, low, _, k = carry
+    if not height(d) < 0:
+        d = np.zeros_like(d)
+    fixed, low = outward(d, g + A @ d), np.inf
+    for _ in range(most):
         x = _minimum(A, g, fixed, d)
         past = ~fixed & ((x < floor) | (x > ceiling))
-        wall = jnp.where(x < floor, floor, ceiling)
-        reach = jnp.where(past, (wall - d) / jnp.where(past, x - d, 1.0), jnp.inf)
-        part = jnp.clip(jnp.min(reach), 0.0, 1.0)
-        first = past & (reach <= part)
-        whole, partly = jnp.clip(x, floor, ceiling), jnp.where(first, wall, jnp.clip(d + part * (x - d), floor, ceiling))
-        farther = height(whole) < height(partly)
-        blocked = jnp.any(past)
+        if past.any():
+            wall = np.where(x < floor, floor, ceiling)
+            reach = np.where(past, (wall - d) / np.where(past, x - d, 1.0), np.inf)
+            part = np.clip(np.min(reach), 0.0, 1.0)
+            first = past & (reach <= part)
+            whole, partly = np.clip(x, floor, ceiling), np.where(first, wall, np.clip(d + part * (x - d), floor, ceiling))
+            farther = height(whole) < height(partly)
+            d, fixed = (whole, fixed | past) if farther else (partly, fixed | first)
+            continue
         # at a minimum of the free: let go of those that pull inward, of one alone where nothing was gained since the last
-        slope = g + A @ x
-        pull = jnp.where(fixed & ~outward(x, slope), jnp.abs(slope), 0.0)
+        d, slope = x, g + A @ x
+        pull = np.where(fixed & ~outward(x, slope), np.abs(slope), 0.0)
         pulled = pull > tolerance
-        gained = height(x) < low - 1e-13 * jnp.abs(low)
-        released = pulled & (gained | (pull >= jnp.max(pull)))
-        d = jnp.where(blocked, jnp.where(farther, whole, partly), x)
-        fixed = jnp.where(blocked, fixed | jnp.where(farther, past, first), fixed & ~released)
-        return d, fixed, jnp.where(blocked, low, height(x)), ~blocked & ~jnp.any(pulled), k + 1
-
-    start = jnp.where(ended | (height(d) < 0), d, 0.0)
-    fixed = outward(start, g + A @ start)
-    d, *_ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < most), onward, (start, fixed, jnp.asarray(jnp.inf), ended, jnp.asarray(0)))
+        if not pulled.any():
+            break
+        gained = np.isfinite(low) and height(x) < low - 1e-13 * np.abs(low)
+        fixed, low = fixed & ~(pulled & (gained | (pull >= np.max(pull)))), height(x)
     return d

@@ -10,6 +10,7 @@ from magjax.constants import MU0
 from magjax.param import in_numpy
 from magjax.preisach.operator import unreached_share
 
+from .solver import bounded_minimum
 from .spectra import evaluate_lines
 
 NEAR_ZERO = 0.3  # of the largest |M|, below which it may change sign
@@ -162,7 +163,7 @@ def agreeing(ranges, turned) -> list[int]:
     return kept
 
 
-def equation_error_start(basis, spectra, deviations, actuator, solve, max_frequency=None, rest=None):
+def equation_error_start(basis, spectra, deviations, actuator, max_frequency=None, rest=None):
     """Density unknowns and the bottom of M from the slower half of the recordings: (x, bottom / total, misfit).
 
     `max_frequency`: take all recordings (any value but None). `misfit`: rms of the weighted equation error, relative.
@@ -189,12 +190,12 @@ def equation_error_start(basis, spectra, deviations, actuator, solve, max_freque
     for weight, D in zip((3.0, 3.0, 30.0, 3.0), basis.penalties, strict=False):
         normal[:n, :n] += weight * D.T @ D
     normal += 1e-8 * np.trace(normal) / len(normal) * np.eye(n + 1)
-    solution = np.asarray(solve(normal, gradient, np.zeros(n + 1), (np.append(np.zeros(n), -np.inf), np.full(n + 1, np.inf))))
+    solution = bounded_minimum(normal, gradient, np.zeros(n + 1), (np.append(np.zeros(n), -np.inf), np.full(n + 1, np.inf)))
     misfit = float(np.sqrt(np.mean((A @ solution - b) ** 2)))
     return np.maximum(solution[:n], 0.0), float(solution[n]), misfit
 
 
-def scan_loss(basis, spectra, deviations, actuator, solve, name, values):
+def scan_loss(basis, spectra, deviations, actuator, name, values):
     """The value of the coil's loss parameter under which all loops are best met by one density: no simulation."""
-    misfits = [equation_error_start(basis, spectra, deviations, actuator.replace({name: v}), solve, np.inf)[2] for v in values]
+    misfits = [equation_error_start(basis, spectra, deviations, actuator.replace({name: v}), np.inf)[2] for v in values]
     return float(values[int(np.argmin(misfits))])

@@ -197,7 +197,7 @@ def test_bounded_minimum_meets_the_optimality_conditions():
         A, g, y = A @ A.T + 0.1 * np.eye(30), rng.standard_normal(30), np.maximum(rng.standard_normal(30), 0)
         y[20:24] = np.minimum(y[20:24], 0.1)
         lower, upper = np.where(np.arange(30) < 24, 0.0, -np.inf), np.where(abs(np.arange(30) - 22) < 3, 0.1, np.inf)
-        d = np.asarray(bounded_minimum(*map(jnp.asarray, (A, g, y, (lower, upper))))) - y
+        d = bounded_minimum(A, g, y, (lower, upper)) - y
         slope, low, high = A @ d + g, y + d < lower + 1e-9, y + d > upper - 1e-9
         assert np.all(y + d > lower - 1e-10) and np.all(y + d < upper + 1e-10)
         assert np.abs(slope[~low & ~high]).max() < 1e-7
@@ -216,7 +216,7 @@ def test_bounded_minimum_reaches_the_optimum_where_the_normal_matrix_is_nearly_s
         A = A + 1e-9 * np.diag(np.diag(A))
         for upper in np.full(120, np.inf), np.full(120, 1.5):
             y = np.minimum(y, upper)
-            d = np.asarray(bounded_minimum(*map(jnp.asarray, (A, g, y, (np.zeros(120), upper))))) - y
+            d = bounded_minimum(A, g, y, (np.zeros(120), upper)) - y
             slope, low, high = (A @ d + g) / np.abs(g).max(), y + d < 1e-12, y + d > upper - 1e-12
             assert (y + d).min() > -1e-10 and np.all(y + d < upper + 1e-10) and g @ d + 0.5 * d @ A @ d < 0
             assert np.abs(slope[~low & ~high]).max() < 1e-7 and high.any() == np.isfinite(upper[0])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..inversion import mass_errors
-from ..joint import data_residual
+from ..joint import data_residual, fields
 from ..spectra import evaluate_lines
 from ..uncertainty import visited_cells
 from .residuals import autocorrelation, by_field_and_rate, by_phase, traces
@@ -51,7 +51,7 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
         "bounds": json.dumps({n: [float(i.low), float(i.high)] for n, (_, i) in result.actuator.parameters().items()}),
     }
     if inside:
-        found["inside"] = {str(k): _inside(result.actuator, spectra[k]) for k in sorted(_extremes(result)[:INSIDE])}
+        found["inside"] = _inside(result, sorted(_extremes(result)[:INSIDE]))
     return found
 
 
@@ -170,18 +170,30 @@ def steady(actuator, s):
     return simulate(actuator, drive, 1 / (s.frequency * count), periodic=True, corners=corners)
 
 
-def _inside(actuator, s) -> dict:
-    """H, I_1 = (H - H_bias)/c0 and M over one period, thinned."""
-    signals = steady(actuator, s)
-    thin = slice(None, None, max(1, len(signals.field) // BINS))
-    H = np.asarray(signals.field)[thin]
-    found = {
-        "phase": np.arange(len(H)) / len(H), "H": H, "M": np.asarray(signals.magnetization)[thin],
-        "applied": np.asarray(actuator.coil.applied_field(signals.current))[thin],
-    }  # fmt: skip
-    if actuator.coil.drive == "current":
-        found["current"] = np.asarray(signals.current)[thin]
-        found["I_1"] = (H - float(actuator.coil.H_bias)) / float(actuator.coil.c0)
+def _inside(result, chosen) -> dict:
+    """H, I_1 = (H - H_bias)/c0 and M over one period of the chosen recordings, thinned."""
+    actuator, problem = result.actuator, result.problem
+    # what the source does to the current, and a stack's polarization, are not in the march
+    plain = actuator.piezo is None and not any(e.block == "source" for e in actuator.effects)
+    marched = fields(problem, result.solution.z) if plain else None
+    found = {}
+    for k in chosen:
+        if plain:
+            current, H, M = marched[k]
+        else:
+            signals = steady(actuator, problem.spectra[k])
+            current, H, M = (np.asarray(x) for x in (signals.current, signals.field, signals.magnetization))
+        thin = slice(None, None, max(1, len(H) // BINS))
+        applied = np.asarray(actuator.coil.applied_field(current))
+        rows = found[str(k)] = {
+            "phase": np.arange(len(H[thin])) / len(H[thin]),
+            "H": H[thin],
+            "M": M[thin],
+            "applied": applied[thin],
+        }
+        if actuator.coil.drive == "current":
+            rows["current"] = current[thin]
+            rows["I_1"] = (rows["H"] - float(actuator.coil.H_bias)) / float(actuator.coil.c0)
     return found
 
 

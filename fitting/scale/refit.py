@@ -58,7 +58,7 @@ def settle(problem: Problem, z, weights, *, jacobian=None, jacobians: int = 4) -
         normal = jacobian.T @ jacobian + prior
         for step in range(CHORDS):
             gradient = jacobian.T @ residual + prior @ z
-            new, predicted = (np.asarray(v) for v in damped_step(normal, gradient, z, damping, bounds))
+            new, predicted = damped_step(normal, gradient, z, damping, bounds)
             trial = data_residual(problem, new)
             new_cost = cost_of(trial, new, prior)
             good, converged = _verdict(cost, new_cost, predicted)
