@@ -1,5 +1,6 @@
 """One table over the whole catalogue: identity at null, gradients, batching, declared facts."""
 
+import collections
 import dataclasses
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.simulate import run_chain, simulate
 from tests.test_simulate import actuator, sine
 
+Rates = collections.namedtuple("Rates", "flux_rate")
 N = 160
 CURRENT = jnp.asarray(sine(N, 0.7))
 DT = 1 / (80 * N)
@@ -235,6 +237,70 @@ def test_backlash_in_detail_is_a_mean_of_plays_beside_an_elastic_path():
         plays = np.mean([play(9e-7 * (1 + spread * c)) for c in (-1, -0.5, 0, 0.5, 1)], axis=0)
         got = np.asarray(effect.displacement(jnp.asarray(y), None, None, line, None))
         assert np.abs(got - (y + (1 - elastic) * (plays - y))).max() < 1e-18
+
+
+def test_excess_loss_in_detail_is_the_law_of_n0_and_v0():
+    """Bertotti's law, which comes to the root at high rates; a share of it lies between."""
+    k, knee = 30.0, 2.0
+    n0_v0, slope = k * knee**0.5, 4 / knee  # A/m, s/T: k = (V0 sigma G S)^(1/2)
+    rate = np.array([-300.0, -3.0, -1e-3, 0.0, 1e-2, 1.0, 40.0, 1e5])
+
+    def shift(full):
+        return np.asarray(effects.ExcessLoss(k=k, rate_knee=knee, full=full).field_shift(Rates(jnp.asarray(rate)), None, None))
+
+    law = np.sign(rate) * n0_v0 / 2 * (np.sqrt(1 + slope * np.abs(rate)) - 1)
+    assert np.abs(shift(1.0) - law).max() < 1e-5 * np.abs(law).max() and shift(1.0)[[2, 4, 5]] == pytest.approx(
+        law[[2, 4, 5]], rel=1e-5
+    )
+    assert shift(1.0)[-1] == pytest.approx(k * 1e5**0.5, rel=0.01)
+    assert shift(0.4) == pytest.approx(0.6 * shift(0.0) + 0.4 * law, rel=1e-5)
+
+
+def test_a_second_mode_in_detail_is_any_two_coupled_masses():
+    """A rod with a mass on a spring and a damper of its own, by the poles and residues of its equations of motion."""
+    w1, xi, ratio, w_m, xi_m = 2 * np.pi * 400, 0.03, 0.15, 2 * np.pi * 650, 0.06
+    mass, spring = np.diag([1, ratio]), np.array([[w1**2 + ratio * w_m**2, -ratio * w_m**2], [-ratio * w_m**2, ratio * w_m**2]])
+    damp = np.array(
+        [[2 * xi * w1 + 2 * ratio * xi_m * w_m, -2 * ratio * xi_m * w_m], [-2 * ratio * xi_m * w_m, 2 * ratio * xi_m * w_m]]
+    )
+
+    def motion(s):
+        return np.linalg.solve(s * s * mass + s * damp + spring, [w1**2, 0])[0]
+
+    inverse = np.linalg.inv(mass)
+    poles = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [-inverse @ spring, -inverse @ damp]]))
+    first, second = sorted((p for p in poles if p.imag > 0), key=abs)
+
+    def numerator(pole):  # (a s + b) over (s - p)(s - p*), from the residue at p
+        residue = motion(pole + 1e-4 * abs(pole)) * 1e-4 * abs(pole)
+        residue = 2 * motion(pole + 5e-5 * abs(pole)) * 5e-5 * abs(pole) - residue
+        return 2 * residue.real, -2 * (residue * pole.conjugate()).real
+
+    (_, b1), (a2, b2) = numerator(first), numerator(second)
+    w0, w2 = abs(first), abs(second)
+    act = Mechanics(f0=w0 / 2 / np.pi, xi=-first.real / w0)
+    gain = b2 / w2**2
+    assert b1 / w0**2 + gain == pytest.approx(1, abs=1e-5)
+    effect = effects.SecondMode(gain=gain, f2=w2 / 2 / np.pi, xi2=-second.real / w2, lead=a2 / w2 / gain)
+    line = Timeline(jnp.asarray(1 / 40 / 200), 200, True)
+    forcing = jnp.asarray(np.random.default_rng(0).normal(size=200))
+    rod = jnp.asarray(line.filter(forcing, lambda s: w0**2 / (s * s + 2 * act.xi * w0 * s + w0**2)))
+    found = np.asarray(effect.displacement(rod, forcing, None, line, dataclasses.replace(actuator(20), mechanics=act)))
+    s = 2j * np.pi * 40 * np.arange(100)
+    true = np.array([motion(one) for one in s])
+    got = np.fft.rfft(found)[:100] / np.fft.rfft(np.asarray(forcing))[:100]
+    assert np.abs(got - true).max() < 1e-4 * np.abs(true).max()
+    assert abs(a2 / w2 / gain) > 0.01  # a matter of the damping, and not nothing here
+
+
+def test_crosstalk_in_detail_comes_late():
+    line, turn = Timeline(jnp.asarray(1 / 80 / 400), 400, True), 2 * np.pi * np.arange(400) / 400
+    current = 0.3 * np.cos(turn) + 0.1 * np.sin(3 * turn)
+    effect = effects.InductiveCrosstalk(kappa=2e-9, tau=4e-4)
+    got = effect.reading(jnp.zeros(400), {"current": jnp.asarray(current)}, line, None)
+    s = 2j * np.pi * 80 * np.arange(201)
+    late = np.fft.irfft(np.fft.rfft(current) * 2e-9 * s / (1 + 4e-4 * s), 400)
+    assert np.asarray(got) == pytest.approx(late, abs=1e-12 * np.abs(late).max())
 
 
 def test_details_of_a_law_are_held_until_they_are_asked_for():

@@ -7,13 +7,17 @@ from .base import AbstractEffect
 
 
 class InductiveCrosstalk(AbstractEffect):
-    """A reading proportional to dI/dt."""
+    """A reading proportional to dI/dt; in detail it comes late, by the shield or the sensor's electronics."""
 
     kappa: Float[Array, ""] = param(0.0, "m s/A", "reading per rate of the current", scale=1e-10, null=0.0, typical=(-1e-8, 1e-8))
 
+    tau: Float[Array, ""] = param(
+        0.0, "s", "lag of what is picked up", low=0.0, scale=5e-5, shape=True, detail=True, typical=(0.0, 1e-3)
+    )
+
     name = "inductive_crosstalk"
     block = "sensor"
-    law = "reading = y + kappa dI/dt"
+    law = "reading = y + kappa d/dt I / (1 + tau s)"
     source = "mutual inductance between drive leads and sensor leads"
     signature = "in quadrature with the current, growing with frequency, at the drive's own lines only"
     amplitude = "kappa"
@@ -21,4 +25,5 @@ class InductiveCrosstalk(AbstractEffect):
 
     def reading(self, reading, signals, line, actuator):
         """Reading with crosstalk."""
-        return reading + self.kappa * line.derivative(signals["current"])
+        rate = line.derivative(signals["current"])
+        return reading + self.kappa * (rate - line.filter(rate, lambda s: s * self.tau / (1 + s * self.tau)))

@@ -8,15 +8,23 @@ from .base import AbstractEffect
 
 
 class SecondMode(AbstractEffect):
-    """A further second-order mode in parallel, driven by the same force, which takes its share of the static displacement."""
+    """A further second-order mode in parallel, driven by the same force, which takes its share of the static displacement.
+
+    In detail it answers the force's rate too, and the first mode makes up for it so that the sum stays of second order at high
+    frequency: modes whose damping is not spread as mass and stiffness are.
+    """
 
     gain: Float[Array, ""] = param(0.0, "1", "static share of the second mode", scale=0.05, null=0.0, typical=(-0.5, 0.5))
     f2: Float[Array, ""] = param(1200.0, "Hz", "its frequency", low=0.0, scale=1200.0, shape=True, typical=(100.0, 5000.0))
     xi2: Float[Array, ""] = param(0.05, "1", "its damping ratio", low=0.0, scale=0.05, shape=True, typical=(0.005, 0.3))
 
+    lead: Float[Array, ""] = param(
+        0.0, "1", "its answer to the rate of the force, at f2", scale=0.1, shape=True, detail=True, typical=(-1.0, 1.0)
+    )
+
     name = "second_mode"
     block = "mechanics"
-    law = "Y = ((1 - gain) G(s) + gain G2(s)) U, G2 of f2, xi2"
+    law = "Y = (G + gain (G2 - G + lead (s / w2) (G2 - (w2 / w0)^2 G))) U, G2 of f2, xi2"
     source = "modal superposition (D. J. Ewins, Modal Testing, 2000)"
     signature = "linear in the forcing: a resonance in the harmonics near f2, whichever drive makes them"
     amplitude = "gain"
@@ -28,4 +36,9 @@ class SecondMode(AbstractEffect):
         def response(s):
             return w2**2 / (s * s + 2 * self.xi2 * w2 * s + w2**2)
 
-        return displacement + self.gain * (line.filter(free_displacement, response) - displacement)
+        def rate(s):
+            return response(s) * s / w2
+
+        w0 = 2 * jnp.pi * actuator.mechanics.f0
+        of_rate = line.filter(free_displacement, rate) - w2 / w0**2 * line.derivative(displacement)
+        return displacement + self.gain * (line.filter(free_displacement, response) - displacement + self.lead * of_rate)
