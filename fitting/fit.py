@@ -13,7 +13,7 @@ from magjax.plausibility import si_unit
 from magjax.simulate import require_x64
 
 from .floors import swapped
-from .joint import data_jacobian, data_residual, prior_matrix, solve
+from .joint import compiled, data_residual, prior_matrix, solve
 from .result import FitResult, RecordingFit
 from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, field_of_rest, free_parameters, spectra_of, with_held_masses
 from .together import together
@@ -76,8 +76,7 @@ def fit(
     problem, z = build_problem(
         spectra, actuator, bench, names, dataclasses.replace(choices, rest=rests_of(bench, choices)[0][0]), _density(start)
     )
-    # compiles both, one while Python traces the other
-    together([lambda _: data_residual(problem, z), lambda _: data_jacobian(problem, z)])
+    compiled(problem, z)
     warm = time.perf_counter() - begin
     problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
     if refine and choices.knots is not None and not solution.interrupted:

@@ -20,6 +20,7 @@ from magjax.programs import kept
 
 from .model import Layout, Predictor, Target, whitened
 from .solver import CHUNK, damped_step, pushed
+from .together import together
 
 WEIGHT_RANGE = (1e-3, 1e9)
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
@@ -187,8 +188,24 @@ def data_jacobian(problem: Problem, z):
     z, predictor = np.asarray(z, float), problem.predictors[0]
     layout, template, place = problem.marching
     marched, tangents = _march_tangents(layout, jnp.asarray(z[place]), template, predictor)
-    arguments = (problem.layout, jnp.asarray(z), problem.target, problem.template, predictor, marched, tangents, jnp.asarray(place))
-    return np.asarray(_read_jacobian(*arguments))
+    return np.asarray(_read(problem, z, marched, tangents))
+
+
+def _read(problem, z, marched, tangents):
+    place = problem.marching[2]
+    arguments = (problem.layout, jnp.asarray(z), problem.target, problem.template, problem.predictors[0], marched, tangents)
+    return _read_jacobian(*arguments, jnp.asarray(place))
+
+
+def compiled(problem: Problem, z) -> None:
+    """Compile what a fit from z needs, side by side: to read a march's tangents does not wait for them."""
+
+    def of_nothing(_):
+        unknowns = len(problem.marching[2])
+        still = tuple((np.zeros(d.shape),) * 2 for d in problem.predictors[0].drives)
+        _read(problem, z, still, jax.tree.map(lambda x: np.zeros((unknowns, *x.shape)), still))
+
+    together([lambda _: data_residual(problem, z), lambda _: data_jacobian(problem, z), of_nothing])
 
 
 def evidence_weights(layout: Layout, z, normal, weights):

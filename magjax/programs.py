@@ -30,7 +30,7 @@ IN_MEMORY: list[dict] = []  # the programs of every function
 
 def kept(function):
     """As `equinox.filter_jit`, for a function of modules, arrays and constants that returns arrays in tuples, lists, dicts and modules."""
-    plain, known = eqx.filter_jit(function), {}
+    plain, known, locks = eqx.filter_jit(function), {}, {}
     IN_MEMORY.append(known)
 
     @functools.wraps(function)
@@ -44,7 +44,13 @@ def kept(function):
         key = (tree, other, tuple(values), tuple((x.shape, str(x.dtype)) for x in leaves))
         program = known.get(key)  # another thread may `forget` it
         if program is None:
-            program = known[key] = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
+            with locks.setdefault(key, threading.Lock()):  # a second thread waits until it is compiled
+                program = known.get(key)
+                if program is None:
+                    program = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
+                    found = program(leaves) if program else plain(*arguments)
+                    known[key] = program
+                    return found
         return program(leaves) if program else plain(*arguments)
 
     return call
@@ -73,7 +79,9 @@ def _program(function, arguments, constants, key, leaves, folder):
         except Exception:  # something in it has no lasting form
             return False
         _write(path, lasting)
-    run = jax.jit(exported.call)
+    # on one device whatever the arguments come from: else each mixture of new arrays and results is compiled anew
+    device = jax.config.jax_default_device or jax.local_devices()[0]
+    run = jax.jit(exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device))
     return lambda leaves: _filled(form, jax.tree.leaves(run(*leaves)))
 
 

@@ -1,5 +1,7 @@
 """Programs kept between processes: read where nothing has changed, traced where anything has."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -64,6 +66,22 @@ def test_it_gives_what_the_traced_one_gives(folder):
         1
     ]  # inside another trace it is a function as any
     assert np.isfinite(np.asarray(slope)).all()
+
+
+def test_it_is_compiled_once(folder):
+    """Whatever the arguments come from, and where two threads ask for it at the same time."""
+    compiled, line = [], Timeline(jnp.asarray(0.5), 6, True)
+    values = [jnp.arange(6.0), np.arange(6.0), scaled(line, jnp.arange(6.0), 5.0)[0][0]]  # the last is a result of such a program
+
+    def count(event, seconds, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda x: scaled(line, x, 2.0)[0][0], values * 4))
+    assert TRACED == [5.0, 2.0] and len(compiled) == 1
+    assert all(np.allclose(one, 2.0 * np.asarray(values[k % 3]) * 0.5) for k, one in enumerate(together))
 
 
 def test_files_that_changed_and_programs_that_were_spoiled_are_made_anew(folder, monkeypatch):

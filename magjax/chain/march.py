@@ -120,7 +120,7 @@ def _replay(scheme, period, fields, actuator, applied, current, h, memory, distu
     def advance(c, now):
         drive, number, v, place, base, rise, along = now
         rhs, trial_at = law.posed(c, drive)
-        corner = jax.lax.dynamic_index_in_dim(c.memory.places, place, keepdims=False)
+        corner = jax.lax.optimization_barrier(c.memory.places.at[place].get(mode="promise_in_bounds"))
         m = corner[1] + base + rise * corner[0]
         slope, extra = law.p + law.q * along, 0.0
         if law.effects:
@@ -133,7 +133,7 @@ def _replay(scheme, period, fields, actuator, applied, current, h, memory, distu
         change = -(law.p * v + law.q * m - rhs + extra) / stop_gradient(slope)
         v, m = v + change, m + along * change
         extra = law.extra(c.states, trial_at(v, m)) if law.effects else (0.0, 0.0, 0.0)
-        places = jax.lax.dynamic_update_index_in_dim(c.memory.places, jnp.stack([v, m]), number, 0)
+        places = c.memory.places.at[number].add(jnp.stack([v, m]), mode="promise_in_bounds", unique_indices=True)
         return law.after(c, drive, trial_at, v, m, extra, _Trace(v, places), law.p * v + law.q * m + extra[0] - rhs)
 
     drive = (applied[1:], current[1:], _ends_of_periods(count, period), *(d[1:] for d in disturbance or ()))
