@@ -375,12 +375,12 @@ def _effect_row(trial, tried, base, final) -> dict:
 
 
 def _sizes(name, result) -> dict:
-    """The parameters of an effect as a fit has them."""
+    """The parameters of an effect as a fit has them, without the details of its law that were held."""
     prefix = f"effects.{name}."
     return {
         e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit}
         for e in result.estimates
-        if e.name.startswith(prefix)
+        if e.name.startswith(prefix) and e.free
     }
 
 

@@ -13,7 +13,8 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
-from fitting.verdict import Evidence, dominant, first_alone, too_little, unconfirmed
+from fitting.uncertainty import Estimate
+from fitting.verdict import Evidence, _sizes, dominant, first_alone, too_little, unconfirmed
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -142,7 +143,7 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     import fitting.search as module
     from magjax.bench import load_bench
 
-    best = trial("second_mode", 1.0)
+    best = trial("sensor_lag", 1.0)
     best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
     again, spoiled = [], []
@@ -162,7 +163,7 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     far = trial("creep", 2.0)
     _, kept, asked = module._finer(task, None, best, [best, far], 1.0)
     assert asked.choices.rest == (found if taken else held) and again == ([found] if taken else [])
-    assert names(kept) == ["second_mode", "creep"]  # it may serve beside a later effect
+    assert names(kept) == ["sensor_lag", "creep"]  # it may serve beside a later effect
     *_, fixed = module._finer(task, None, best, [best], 1.0, any_rest=False)
     assert fixed.choices.rest == held
     spoiled.append(True)  # what ends far off from there is not taken
@@ -503,3 +504,11 @@ def test_zeros_of_the_recordings_are_dropped_where_an_effect_meets_the_means_too
     assert _needless_zeros(Told((1.1, *ten), None), found) and not _needless_zeros(Told((1.2, *ten), None), found)
     assert not _needless_zeros(Told((1.1,), None), found)  # one zero that takes as much
     assert not _needless_zeros(Told((1.01, *ten), None), Reached(current, [], {}))  # the zeros are all there is
+
+
+def test_details_of_a_law_that_were_held_are_no_size():
+    rows = [("k", 26.0, 1.1, True), ("rate_knee", 3.8, 2.0, True), ("full", 0.0, 0.0, False)]
+    estimates = [Estimate(f"effects.excess_loss.{n}", value, error, "1", "", free, value) for n, value, error, free in rows]
+    estimates.append(Estimate("effects.creep.gain", 0.1, 0.01, "1", "", True, 0.0))
+    sizes = _sizes("excess_loss", SimpleNamespace(estimates=estimates))
+    assert {n: (p["value"], p["stderr"]) for n, p in sizes.items()} == {"k": (26.0, 1.1), "rate_knee": (3.8, 2.0)}

@@ -27,7 +27,7 @@ class ExcessLoss(AbstractEffect):
 
     name = "excess_loss"
     block = "coil"
-    law = "H_exc = k r ((1 - full) / (r^2 + rate_knee^2)^(1/4) + 2 full / (rate_knee^(1/2) + (rate_knee + 4 |r|)^(1/2))), r = dB/dt"
+    law = "H_exc = k r / (r^2 + rate_knee^2)^(1/4), in detail towards 2 k r / (rate_knee^(1/2) + (rate_knee + 4 |r|)^(1/2)), r = dB/dt"
     source = "G. Bertotti, IEEE Trans. Magn. 24 (1988) 621: H_exc = (n0 V0/2)(sqrt(1 + 4 sigma G S dB/dt/(n0^2 V0)) - 1)"
     signature = "loops widen as the root of the rate: more than eddy currents at low, less at high frequency"
     amplitude = "k"

@@ -24,7 +24,7 @@ class SecondMode(AbstractEffect):
 
     name = "second_mode"
     block = "mechanics"
-    law = "Y = (G + gain (G2 - G + lead (s / w2) (G2 - (w2 / w0)^2 G))) U, G2 of f2, xi2"
+    law = "Y = ((1 - gain) G + gain G2 + gain lead (s / w2) (G2 - (w2 / w0)^2 G)) U, G2 of f2, xi2"
     source = "modal superposition (D. J. Ewins, Modal Testing, 2000)"
     signature = "linear in the forcing: a resonance in the harmonics near f2, whichever drive makes them"
     amplitude = "gain"
