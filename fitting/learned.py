@@ -96,7 +96,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
             z[n + 1 : n + 1 + len(names)] = moved  # noqa: F821
         solution = solve(
             problem, z, weights, max_jacobians=choices.max_jacobians,
-            progress=lambda k, c: say(f"learning {' and '.join(place.variables)} at the {place.block}", k, c),
+            progress=lambda k, c: say(f"learning {place.joined(str)} at the {place.block}", k, c),
         )  # fmt: skip
         if solution.interrupted:
             raise KeyboardInterrupt
@@ -157,9 +157,10 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
     tried = sorted((t for t in tried if np.isfinite(t.result.chi2_per_sample)), key=lambda t: t.left_out[1])
     if not tried or not tried[0].worth:
         return None
-    best = tried[0]
-    near = 1 + 1.3 * (best.left_out[1] - 1) + 0.1
-    rivals = tuple(t.place for t in tried[1:] if t.left_out[1] < near)
+    near = 1 + 1.3 * (tried[0].left_out[1] - 1) + 0.1
+    # of those that serve as well, the one that the rest of the model hides least: another must be larger to be seen as much
+    best, *others = sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: -t.place.visibility)
+    rivals = tuple(t.place for t in others)
     return dataclasses.replace(best, places=tuple(places), rivals=rivals)
 
 
@@ -249,19 +250,23 @@ def described(learned: Learned) -> dict:
         )
     reading, terms = learned.result.recordings[0].unit, learned.result.bench.terms
     unit = reading if OUTPUTS[term.place] == "reading" else terms.unit_of(OUTPUTS[term.place])
-    named = lambda v: terms.word(v).replace(" ", "_")
+
+    def named(place):
+        names = [terms.word(v).replace(" ", "_") for v in place.variables]
+        return [*names[:-1], f"times_{names[-1]}"] if place.term.counts[-1] == 1 else names
+
     units = [terms.unit_of(UNITS[v]).replace("reading", reading) for v in term.variables]
     axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(low, high, strict=True)), indexing="ij")
     return {
-        "variables": [named(v) for v in term.variables], "variable_units": units, "unit": unit, "share": learned.share,
+        "variables": named(learned.place), "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
         "left_out": list(learned.left_out), "bends_over": learned.place.length,
         "function": {"x": x.tolist(), "slices": slices},
         "boundaries": [
-            {"block": p.block, "variables": [named(v) for v in p.variables], "evidence": p.evidence, "share": p.share, "visibility": p.visibility}
+            {"block": p.block, "variables": named(p), "evidence": p.evidence, "share": p.share, "visibility": p.visibility}
             for p in learned.places
         ],
-        "rivals": [{"block": p.block, "variables": [named(v) for v in p.variables]} for p in learned.rivals],
+        "rivals": [{"block": p.block, "variables": named(p)} for p in learned.rivals],
     }  # fmt: skip
 
 
@@ -291,12 +296,12 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None):
     unknown = {**(found.unknown or {}), "block": place.block, "region": where, **more}
     nearest = f"{learned.share:.0%} of the excess"
     text = (
-        f"something is missing that no effect of the catalogue explains. It acts like a function of {' and '.join(words(v) for v in place.variables)} "
+        f"something is missing that no effect of the catalogue explains. It acts like a function of {place.joined(words)} "
         f"at the {place.block} ({where}): learned as one, it takes {nearest} (chi2/N {base.chi2_per_sample:.3g} -> {learned.result.chi2_per_sample:.3g}; "
         f"recordings left out {learned.left_out[0]:.3g} -> {learned.left_out[1]:.3g})."
     )
     if learned.rivals:
-        rivals = [f"{p.block} ({' and '.join(words(v) for v in p.variables)})" for p in learned.rivals]
+        rivals = [f"{p.block} ({p.joined(words)})" for p in learned.rivals]
         text += f" Not told from it: {'; '.join(rivals)}."
     better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
     text += f" On check recordings: {better}." if better else ""

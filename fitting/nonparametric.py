@@ -43,6 +43,11 @@ SETS = (
     ("sensor", ("reading",)), ("sensor", ("reading_rate",)), ("sensor", ("reading", "reading_rate")), ("sensor", ("current_rate",)),
     ("sensor", ("current", "current_rate")),
 )  # fmt: skip
+FACTORS = (  # a function of the first, times the second: a loss, an inductance, a damping that varies
+    ("source", ("current", "current_rate")), ("coil", ("magnetization", "flux_rate")), ("coil", ("field", "flux_rate")),
+    ("hysteresis", ("magnetization", "field_rate")), ("mechanics", ("displacement", "displacement_rate")),
+    ("mechanics", ("magnetization", "displacement_rate")), ("sensor", ("reading", "reading_rate")),
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +63,11 @@ class Place:
     size: float
     visibility: float
     term: LearnedTerm = dataclasses.field(repr=False)
+
+    def joined(self, word) -> str:
+        """The variables by `word(name)`: "a and b", or "a, times b" where b is a factor."""
+        names = [word(v) for v in self.variables]
+        return ", times ".join(names) if self.term.counts[-1] == 1 else " and ".join(names)
 
 
 @kept
@@ -212,8 +222,8 @@ def evidence(columns, residual, counts, freedom: float):
 
 
 def applicable_sets(actuator, signals, quasistatic: bool):
-    """Boundaries and variables that this actuator has."""
-    for block, variables in SETS:
+    """Boundaries and variables that this actuator has, with the numbers of cosines to try."""
+    for block, variables, counts in (*((*p, _resolutions(*p)) for p in SETS), *((*p, _of_one(p[0])) for p in FACTORS)):
         if block in ("magnetostriction", "mechanics") and getattr(actuator, block) is None:
             continue
         if block == "coil" and actuator.coil.drive == "voltage":
@@ -222,7 +232,7 @@ def applicable_sets(actuator, signals, quasistatic: bool):
             continue
         if quasistatic and any(v.endswith("_rate") for v in variables):
             continue
-        yield block, variables
+        yield block, variables, counts
 
 
 def locate_places(result, say=lambda *a: None) -> list[Place]:
@@ -231,9 +241,9 @@ def locate_places(result, say=lambda *a: None) -> list[Place]:
     residual = tangents.projector.residual
     freedom = max(len(residual) - tangents.projector.basis.shape[1], 10)
     found = []
-    for block, variables in applicable_sets(tangents.actuator, tangents.signals, tangents.problem.quasistatic):
+    for block, variables, tried in applicable_sets(tangents.actuator, tangents.signals, tangents.problem.quasistatic):
         say(f"a function of {' and '.join(variables)} at the {block}", 0, None)
-        for counts in _resolutions(block, variables):
+        for counts in tried:
             term = null_term(block, variables, tangents.signals, tangents.actuator, counts)
             columns = tangents.columns(term)
             if not np.isfinite(columns).all():
@@ -265,3 +275,7 @@ def _resolutions(block, variables):
     if len(variables) == 2:
         return [TWO]
     return [(ONE,), (FINE,)] if block in ("sensor", "magnetostriction") and not variables[0].endswith("_rate") else [(ONE,)]
+
+
+def _of_one(block):
+    return [(2 * IN_STEP[0] if block in ("coil", "hysteresis") else ONE, 1)]

@@ -16,7 +16,7 @@ def parts(unknown, sketch) -> list:
         return []
     before, after = unknown["left_out"]
     rows = [
-        ["function of", " and ".join(v.replace("_", " ") for v in unknown["variables"])],
+        ["function of", _joined(unknown["variables"])],
         ["share of the excess that it takes", percent(unknown["share"])],
         ["χ²/N of recordings left out one at a time", f"{plain(before)} → {plain(after)}"],
         ["rms over the range seen", _with_unit(unknown["rms"], unknown["unit"])],
@@ -34,6 +34,10 @@ def parts(unknown, sketch) -> list:
     ]
 
 
+def _joined(variables):
+    return " and ".join(variables).replace(" and times_", ", times ").replace("_", " ")
+
+
 def _with_unit(value, unit):
     factor, label = FINE.get(unit, (1.0, unit))
     return f"{plain(factor * value)} {label}"
@@ -49,7 +53,7 @@ def _boundaries(unknown):
         rows.append(
             [
                 b["block"],
-                " and ".join(v.replace("_", " ") for v in b["variables"]),
+                _joined(b["variables"]),
                 plain(b["evidence"]),
                 percent(b["share"]),
                 percent(b["visibility"]),

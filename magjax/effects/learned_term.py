@@ -35,10 +35,11 @@ class LearnedTerm(AbstractEffect):
     """What a block adds to its output: size * sum of coefficients * products of cosines in scaled variables.
 
     A variable x is scaled to s in 0..1 over the range seen, `low` to `high`, rates as arsinh(x / knee); the cosines are
-    cos(k pi (s + PAD)/(1 + 2 PAD)). Beyond the range the function stays as at its edge, plus `beyond` times the scaled
-    distance: zero, but uncertain. `deviation`: prior standard deviation of each coefficient, which falls with k as the
-    spectrum of a smooth random function. Added: to the current (A), to the loss or to the relays' field (A/m), to the
-    free displacement (m), as a force in metres of free displacement, or to the reading.
+    cos(k pi (s + PAD)/(1 + 2 PAD)). A variable of one wave is a factor, x over its largest value: a loss per rate, a damping.
+    Beyond the range the function stays as at its edge, plus `beyond` times the scaled distance: zero, but uncertain.
+    `deviation`: prior standard deviation of each coefficient, which falls with k as the spectrum of a smooth random
+    function. Added: to the current (A), to the loss or to the relays' field (A/m), to the free displacement (m), as a force
+    in metres of free displacement, or to the reading.
     """
 
     coefficients: tuple[Float[Array, ""], ...]
@@ -105,6 +106,11 @@ class LearnedTerm(AbstractEffect):
         product, outside = None, []
         for x, low, high, knee, count in zip(values, self.low, self.high, self.knee, self.counts, strict=True):
             low, high, knee = (xp.asarray(v) for v in (low, high, knee))
+            if count == 1:
+                x = x / xp.maximum(xp.abs(low), xp.abs(high))
+                outside += [xp.zeros_like(x)] * 2
+                product = x[None] if product is None else product * x[None]
+                continue
             width = xp.where(knee > 0, knee, 1.0)
             x, low, high = (xp.where(knee > 0, xp.arcsinh(v / width), v) for v in (x, low, high))
             s = (x - low) / (high - low)

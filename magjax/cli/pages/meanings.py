@@ -95,7 +95,7 @@ INNER = {
     "unknown.block": "block whose effects act most like the misfit",
     "unknown.region": "where in the drive or the variable it shows most",
     "unknown.explained_share": "share of the misfit that the nearest effect explains, 0 .. 1",
-    "unknown.variables": "local variables of which it acts as a function; block, region and what follows are there where a learned term is kept",
+    "unknown.variables": "local variables of which it acts as a function, `times_` before one that is a factor; block, region and what follows are there where a learned term is kept",
     "unknown.variable_units": "their units",
     "unknown.unit": "unit of what the function adds at the block",
     "unknown.share": "share of the excess misfit that the learned term takes, 0 .. 1",
