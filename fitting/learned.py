@@ -22,11 +22,11 @@ from .setup import build_problem
 from .together import let_go
 from .uncertainty import WIDEN, covariance
 
-TRIED = 3  # leaders that are fitted jointly
+TRIED = 4  # leaders that are fitted jointly
 NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
 CLOSE = 0.96
-SIMPLER = 0.93  # of the evidence is enough for one variable in place of two
+SIMPLER, SOME_WAY = 0.93, 0.8  # of the evidence is enough for one variable in place of two, or to be tried beside it
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 GRID = 121
@@ -130,14 +130,19 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
 
 
 def chosen_places(places) -> list[Place]:
-    """Places worth a joint fit: the best of each block whose evidence comes near the first, one variable before two."""
+    """Places worth a joint fit: of each block whose evidence comes near the first, a function of one variable where it
+    serves nearly as well, else the best; in the first block both where the simpler one comes some way: it may foretell more."""
     best = places[0].evidence
     chosen = []
     for block in dict.fromkeys(p.block for p in places):
         mine = [p for p in places if p.block == block]
-        simple = [p for p in mine if len(p.variables) == 1 and p.evidence > SIMPLER * mine[0].evidence]
-        if mine[0].evidence > NEAR * best:
-            chosen.append(simple[0] if simple else mine[0])
+        if mine[0].evidence <= NEAR * best:
+            continue
+        simple = next((p for p in mine if p.simple), mine[0])
+        if simple.evidence > (SIMPLER if chosen else SOME_WAY) * mine[0].evidence:
+            chosen.append(simple)
+        if simple.evidence <= SIMPLER * mine[0].evidence:
+            chosen.append(mine[0])
     return chosen[:TRIED]
 
 

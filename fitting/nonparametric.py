@@ -64,6 +64,11 @@ class Place:
     visibility: float
     term: LearnedTerm = dataclasses.field(repr=False)
 
+    @property
+    def simple(self) -> bool:
+        """Whether it is a function of one variable, times another at most."""
+        return len(self.variables) == 1 or self.term.counts[-1] == 1
+
     def joined(self, word) -> str:
         """The variables by `word(name)`: "a and b", or "a, times b" where b is a factor."""
         names = [word(v) for v in self.variables]

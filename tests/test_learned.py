@@ -255,3 +255,24 @@ def test_the_prediction_is_less_sure_beyond_what_was_seen():
     inside = prediction_interval(learned, 0.3 * np.sin(phase), 1 / 2500)[1]
     beyond = prediction_interval(learned, 0.8 * np.sin(phase), 1 / 2500)[1]
     assert beyond.max() > 5 * inside.max() > 0
+
+
+def test_a_simple_function_is_tried_where_it_comes_some_way():
+    """Alone where it serves nearly as well as one of two variables; beside that one in the leading block; else not."""
+    from fitting.learned import chosen_places
+
+    def place(block, variables, evidence, factor=False):
+        counts = (4, 1) if factor else (4,) * len(variables)
+        return Place(block, variables, evidence, 0.9, 0.5, 1.0, 0.1, types.SimpleNamespace(counts=counts))
+
+    both, alone = ("displacement", "displacement_rate"), ("displacement_rate",)
+
+    def chosen(share, block="mechanics", factor=False):
+        places = (
+            [place("mechanics", both, 100.0), place(block, both, 99.0)] if block != "mechanics" else [place(block, both, 100.0)]
+        )
+        return [p.variables for p in chosen_places([*places, place(block, both if factor else alone, share, factor)])]
+
+    assert chosen(94.0) == [alone] and chosen(85.0) == [alone, both] and chosen(70.0) == [both]
+    assert chosen(85.0, factor=True) == [both, both]  # a factor counts as one of one
+    assert chosen(85.0, "sensor") == [both, both] and chosen(95.0, "sensor") == [both, alone]
