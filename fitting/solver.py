@@ -60,7 +60,7 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         def attempt(carry):
             damping, _, _, _, tried = carry
-            new, predicted = _called_back(normal, gradient, y, damping, self.bounds)
+            new, predicted = traced_step(normal, gradient, y, damping, self.bounds)
             new_cost = 0.5 * jnp.sum(fn(new, args)[0] ** 2)
             ratio = (cost - new_cost) / jnp.maximum(predicted, 1e-300)
             good = (ratio > 1e-3) & jnp.isfinite(new_cost)
@@ -69,8 +69,8 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
         start = (state.damping, y, cost, jnp.asarray(False), jnp.asarray(0))
         damping, new, new_cost, good, _ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < self.trials), attempt, start)
-        _, decrement = _called_back(normal, gradient, y, jnp.asarray(1e-9), self.bounds)
         fallen = cost - new_cost
+        decrement = jnp.maximum(traced_step(normal, gradient, y, 1e-9, self.bounds)[1], fallen)
         tolerance = self.atol + self.rtol * new_cost
         done = (decrement < tolerance) | ~good
         state = ProjectedState(
@@ -96,16 +96,38 @@ def damped_step(normal, gradient, y, damping, bounds):
     return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
 
 
-def _called_back(normal, gradient, y, damping, bounds):
-    """`damped_step` within a compiled program."""
-    shapes = jax.ShapeDtypeStruct(y.shape, y.dtype), jax.ShapeDtypeStruct((), y.dtype)
-    return jax.pure_callback(_with_arrays, shapes, normal, gradient, y, damping, *bounds)
+def traced_step(normal, gradient, y, damping, bounds, rounds: int = 25):
+    """`damped_step` within a compiled program, by block pivoting alone; where that has not ended (a nearly singular
+    matrix) the fall may be none, and more damping is asked for. No call back to NumPy: those may wait for one another forever."""
+    scale = jnp.diagonal(normal)
+    scale = scale + 1e-12 * jnp.max(scale)
+    root = jnp.sqrt(jnp.maximum((1 + damping) * scale, 1e-300))
+    A = (normal + jnp.diag(damping * scale)) / jnp.outer(root, root)
+    g, floor, ceiling = gradient / root, (bounds[0] - y) * root, (bounds[1] - y) * root
 
+    def pivot(carry):
+        side, _, best, count, k = carry  # -1 at the floor, 1 at the ceiling, 0 free
+        free = side == 0
+        held = jnp.where(free, 0.0, jnp.where(side < 0, floor, ceiling))
+        factor = jax.scipy.linalg.cho_factor(
+            jnp.where(jnp.outer(free, free), A, 0.0) + jnp.diag(jnp.where(free, 1e-13, 1.0)), lower=True
+        )
+        d = held + jax.scipy.linalg.cho_solve(factor, jnp.where(free, -(g + A @ held), 0.0))
+        past = (d > ceiling + 1e-12) * 1 - (d < floor - 1e-12) * 1
+        proper = jnp.where(free, past, jnp.where(side * (g + A @ d) > 1e-12, 0, side))
+        bad = proper != side
+        number = jnp.sum(bad)
+        last = jnp.arange(len(g)) == jnp.max(jnp.where(bad, jnp.arange(len(g)), -1))
+        single = (number >= best) & (count >= 3)  # Murty's exchange once the blocks' makes no progress
+        count = jnp.where(number < best, 0, count + 1)
+        return jnp.where(single & ~last, side, proper), d, jnp.minimum(best, number), count, k + 1
 
-def _with_arrays(*given):
-    *first, lower, upper = (np.asarray(x) for x in given)
-    new, predicted = damped_step(*first, (lower, upper))
-    return new, np.asarray(predicted)
+    side = ((ceiling <= 0) & (g < 0)) * 1 - ((floor >= 0) & (g > 0)) * 1
+    start = side, jnp.zeros_like(g), jnp.asarray(len(g) + 1), jnp.asarray(0), jnp.asarray(0)
+    side, d, *_ = jax.lax.while_loop(lambda c: (c[2] > 0) & (c[4] < rounds), pivot, start)
+    new = jnp.where(d <= floor, bounds[0], jnp.where(d >= ceiling, bounds[1], y + d / root))
+    delta = new - y
+    return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
 
 
 def jacobian(fn, y):

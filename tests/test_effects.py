@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import re
 
 import equinox as eqx
 import jax
@@ -65,7 +66,11 @@ def test_null_gradient_and_batch(kind):
         return jax.jvp(lambda v: reading(extended.replace({name: v}), current), (value,), (jnp.ones_like(value),))
 
     drives = jnp.stack([CURRENT, CURRENT, CURRENT, 0.5 * CURRENT])
-    found, slopes = map(np.asarray, readings_and_slopes(value + step * jnp.asarray([0.0, 1.0, -1.0, 0.0]), drives))
+    values = value + step * jnp.asarray([0.0, 1.0, -1.0, 0.0])
+    program = readings_and_slopes.lower(values, drives)
+    # no batch of matrices for LAPACK, see `magjax.linear`, but of exponentials of 4 x 4
+    assert set(re.findall(r"custom_call @lapack_dgetrf.*?: \(tensor<4x(\d+)x", program.as_text())) <= {"4"}
+    found, slopes = map(np.asarray, program.compile()(values, drives))
     number = (found[1] - found[2]) / (2 * step)
     assert np.abs(number).max() > 0
     assert np.abs(slopes[0] - number).max() < 2e-4 * np.abs(number).max()

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+import scipy.optimize
 
 import magjax.bench
 from fitting.check import check_errors
@@ -233,6 +234,17 @@ def test_solver_runs_behind_optimistix():
     solution = optx.least_squares(residual, ProjectedLevenbergMarquardt(bounds, atol=1e-9), jnp.ones(3), max_steps=50)
     assert float(solution.value[1]) == 0.0 and float(solution.value[2]) == 2.5
     assert float(solution.value[0]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_solver_behind_optimistix_bears_hundreds_of_unknowns():
+    """As `scipy.optimize.nnls` ends; with a call back to NumPy in the step this waited forever."""
+    rng = np.random.default_rng(0)
+    A, b = rng.standard_normal((600, 300)), rng.standard_normal(600)
+    bounds = jnp.zeros(300), jnp.full(300, jnp.inf)
+    solver = ProjectedLevenbergMarquardt(bounds, rtol=1e-12, atol=1e-12)
+    found = optx.least_squares(lambda y, args: jnp.asarray(A) @ y - jnp.asarray(b), solver, jnp.ones(300), max_steps=50).value
+    expected, _ = scipy.optimize.nnls(A, b)
+    assert np.abs(np.asarray(found) - expected).max() < 1e-6 * expected.max() and 50 < (expected == 0).sum() == (found == 0).sum()
 
 
 def test_lines_need_no_whole_periods():

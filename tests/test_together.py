@@ -1,5 +1,8 @@
 """Fits side by side: order, errors, Ctrl-C."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -84,3 +87,20 @@ def test_what_another_makes_needless_is_ended_and_given_up():
 
     quick = together([lambda say: "done before", lambda say: time.sleep(0.1) or "serves", endless], None, needless)
     assert quick == [None, "serves", None]  # whether it was done before or not: the clock decides nothing
+
+
+def test_programs_side_by_side_end():
+    """Two at once, each with inverses of a batch: split among the threads that programs run on they would wait forever."""
+    code = """
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from fitting.together import together
+from magjax.linear import inverse_of
+
+run = jax.jit(lambda A: jax.lax.scan(lambda X, _: (X + 1e-3 * jax.vmap(inverse_of)(X), None), A, length=100)[0])
+A = np.random.default_rng(0).standard_normal((12, 65, 65)) + 10 * np.eye(65)
+together([lambda _: [np.asarray(run(A)) for _ in range(15)] for _ in range(2)])
+"""
+    subprocess.run(
+        [sys.executable, "-c", code], check=True, timeout=200, env={**os.environ, "XLA_FLAGS": "", "JAX_PLATFORMS": "cpu"}
+    )

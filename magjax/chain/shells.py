@@ -18,6 +18,7 @@ from jax.lax import stop_gradient
 
 from ..constants import MU0
 from ..effects.base import Trial
+from ..linear import inverse_of
 from ..preisach.memory import apply_field, branch_magnetization
 from .coupled import March, _extra_terms, _settle, _slope, run_march
 
@@ -146,7 +147,7 @@ def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
         along = jnp.sum(F * rise * step)  # of the potential whose gradient F is: above zero the minimum was passed
         good = (along <= OVERSHOOT * descent) | (scale < 1e-6)
         v = jnp.where(good, v + scale * step, v)
-        fresh = -jnp.linalg.solve(J, F)
+        fresh = -inverse_of(J) @ F
         step, descent = jnp.where(good, fresh, step), jnp.where(good, -jnp.sum(F * rise * fresh), descent)
         return v, step, descent, jnp.where(good, 1.0, 0.5 * scale), jnp.where(good, jnp.max(jnp.abs(F)), jnp.inf), number + 1
 
@@ -158,7 +159,7 @@ def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
 
     walk = (start, jnp.zeros_like(start), jnp.zeros(()), jnp.ones(()), jnp.full((), jnp.inf), 0)
     v = stop_gradient(jax.lax.while_loop(unsettled, refine, walk)[0])
-    inverse = stop_gradient(jnp.linalg.inv(misfit(v)[1]))
+    inverse = stop_gradient(inverse_of(misfit(v)[1]))
     _, slope, rising, kept = stop_gradient(_relays(fixed[0], fixed[1].memory, v))
 
     def live(memory, rising, kept, v):

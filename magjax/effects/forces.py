@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
+from ..linear import inverse_of
+
 HARMONICS = 32  # of a periodic drive, that Newton's method couples; the others follow by a fixed point
 NEWTON = 4
 ROUNDS = 12  # of the fixed point for a force that is not local in time, under a drive that does not repeat
@@ -40,7 +42,7 @@ def _balanced(displacement, force, given, series, line, mechanics):
 
     def inverse_at(y):
         pushed = jax.vmap(lambda d: jax.jvp(lambda x: left(x, *frozen), (y,), (d,))[1])(basis)
-        return jnp.linalg.inv(basis @ pushed.T)
+        return inverse_of(basis @ pushed.T)
 
     def step(y, inverse, terms):
         r = left(y, *terms)
