@@ -70,6 +70,7 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         start = (state.damping, y, cost, jnp.asarray(False), jnp.asarray(0))
         damping, new, new_cost, good, _ = jax.lax.while_loop(lambda c: ~c[3] & (c[4] < self.trials), attempt, start)
         fallen = cost - new_cost
+        # what fell was there to fall, also where the pivoting without damping does not end
         decrement = jnp.maximum(traced_step(normal, gradient, y, 1e-9, self.bounds)[1], fallen)
         tolerance = self.atol + self.rtol * new_cost
         done = (decrement < tolerance) | ~good
