@@ -15,7 +15,6 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import structural_rank
 
-from magjax.preisach.everett import everett_table
 from magjax.programs import kept
 
 from .model import Layout, Predictor, Target, whitened
@@ -92,7 +91,7 @@ class Solution:
 
 @kept
 def _march(layout, z, template, predictor):
-    return predictor.march(layout.actuator(template, z), layout.levels(z))
+    return predictor.march(layout.actuator(template, z, layout.plane(z)), layout.levels(z))
 
 
 @kept
@@ -107,8 +106,7 @@ def _march_tangents(layout, z, template, predictor):
         y = jnp.concatenate([jax.lax.stop_gradient(z[:n]), rest])
         return predictor.march(layout.actuator(template, y, (masses, values)), layout.levels(y))
 
-    masses = layout.masses(z)
-    values = everett_table(masses, 0.0, 1.0, 0.0).values
+    masses, values = layout.plane(z)
     marched, push = jax.linearize(march, masses, values, z[n:])
     return marched, _every_unknown(push, layout, masses.shape, z.shape[0] - n)
 

@@ -129,6 +129,12 @@ class Layout(eqx.Module):
         side = self.tables.shape[1] - 1
         return (self.total * (self.cells @ z[: self.density_unknowns])).reshape(side, side)
 
+    def plane(self, z):
+        """Masses and their Everett values at the levels, A/m, as sums over the basis, whose own are known; None where they are held."""
+        if self.held is not None:
+            return None
+        return self.masses(z), self.total * jnp.tensordot(z[: self.density_unknowns], self.tables, 1)
+
     def actuator(self, template, z, plane=None):
         """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable).
 

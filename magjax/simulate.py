@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from .chain import Timeline
@@ -89,16 +90,21 @@ def march_chain(actuator, line, current, periods: int, corners: int, scheme: str
         whole = [jnp.append(x, x[:1]) for x in (applied, current)]
         march = march_of(actuator, applied[0], current[0], line.dt, memory, scheme, count)
         *rows, overflow, change = run_until_steady(march, *whole, *until)
-        M_unreached = actuator.hysteresis.unreached(jnp.max(rows[2]), jnp.min(rows[2]))
+        M_unreached = actuator.hysteresis.unreached(*_range(rows[2]))
         H, M, v, residual = (jnp.roll(x, 1) for x in rows)  # a period's end is its first sample
     else:
         whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (applied, current)]
         *rows, overflow = magnetize(actuator, *whole, line.dt, memory, scheme, period=count)
-        M_unreached = actuator.hysteresis.unreached(jnp.max(rows[2][-count:]), jnp.min(rows[2][-count:]))
+        M_unreached = actuator.hysteresis.unreached(*_range(rows[2][-count:]))
         H, M, v, residual = (x[-count - 1 : -1] for x in rows)
         X = (rows[0] + rows[1])[:-1].reshape(periods, count)
         change = period_change(X[-1], X[-2]) if periods > 1 else jnp.asarray(jnp.inf)
     return H, M + M_unreached, v, residual, overflow, change
+
+
+def _range(field):
+    """Highest and lowest of a field over time: read at their place, which asks less of a derivative than a maximum."""
+    return field[jnp.argmax(stop_gradient(field))], field[jnp.argmin(stop_gradient(field))]
 
 
 def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, unsettled=0.0) -> Signals:

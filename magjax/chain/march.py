@@ -16,7 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.lax import stop_gradient
 
 from ..preisach.memory import Memory, branch_magnetization
-from .coupled import _at_rest, _ends_of_periods, _law, _slope, march_of, run_march, stop_gradient_trial
+from .coupled import _at_rest, _ends_of_periods, _law, march_of, run_march, stop_gradient_trial
 
 
 def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid", disturbance=None, period: int = 0):
@@ -112,8 +112,8 @@ def _replay(scheme, period, fields, actuator, applied, current, h, memory, distu
     known = places.shape[0] - count
     frozen, v = stop_gradient(table), fields[1:]
     rising, place, threshold = stop_gradient(_branches(frozen, stop_gradient(carry.memory), fields))
-    along = _slope(frozen, v, threshold, rising)
-    rise = jax.jvp(lambda x: branch_magnetization(frozen, rising, x, 0.0, v), (threshold,), (jnp.ones_like(threshold),))[1]
+    moved = jax.linearize(lambda x, y: branch_magnetization(frozen, rising, x, 0.0, y), threshold, v)[1]
+    rise, along = moved(jnp.ones_like(v), jnp.zeros_like(v)), moved(jnp.zeros_like(v), jnp.ones_like(v))
     base = branch_magnetization(table, rising, threshold, 0.0, v) - rise * threshold
     carry = eqx.tree_at(lambda c: c.memory, carry, _Trace(carry.memory.field, places))
 

@@ -1,6 +1,7 @@
 """What commands share: JAX set up once, common options, progress, output folders that are checked before the work."""
 
 import argparse
+import gc
 import json
 import math
 import os
@@ -14,6 +15,7 @@ from .waiting import tell
 
 def prepare_jax() -> None:
     """Double precision and a compilation cache that outlives the run."""
+    gc.set_threshold(50_000, 20, 20)  # traced programs are millions of objects that stay: to look through them takes a second
     import jax
 
     jax.config.update("jax_enable_x64", True)
