@@ -12,3 +12,19 @@ def inverse_of(matrix):
     at once, as of fits side by side, then wait for one another forever.
     """
     return jnp.linalg.inv(matrix)
+
+
+TERMS = 14  # of the series: 0.5^15 / 15! is below rounding
+MOST_SQUARINGS = 40  # a norm of 2^39
+
+
+def exponential_of(matrix):
+    """exp of (n, n) by scaling and squaring of its series: products alone, so that batches of it are no work for LAPACK."""
+    norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=1)))
+    squarings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(norm, 1e-300))) + 1, 0, MOST_SQUARINGS)
+    scaled = matrix * 2.0**-squarings
+    one = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    total = one
+    for k in range(TERMS, 0, -1):
+        total = one + scaled @ total / k
+    return jax.lax.fori_loop(0, MOST_SQUARINGS, lambda k, x: jnp.where(k < squarings, x @ x, x), total)

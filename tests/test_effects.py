@@ -68,8 +68,8 @@ def test_null_gradient_and_batch(kind):
     drives = jnp.stack([CURRENT, CURRENT, CURRENT, 0.5 * CURRENT])
     values = value + step * jnp.asarray([0.0, 1.0, -1.0, 0.0])
     program = readings_and_slopes.lower(values, drives)
-    # no batch of matrices for LAPACK, see `magjax.linear`, but of exponentials of 4 x 4
-    assert set(re.findall(r"custom_call @lapack_dgetrf.*?: \(tensor<4x(\d+)x", program.as_text())) <= {"4"}
+    # no batch of matrices for LAPACK, see `magjax.linear`
+    assert not re.findall(r"custom_call @lapack_\w+.*?: \(tensor<4x\d+x\d+x", program.as_text())
     found, slopes = map(np.asarray, program.compile()(values, drives))
     number = (found[1] - found[2]) / (2 * step)
     assert np.abs(number).max() > 0

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..linear import exponential_of
 from ..param import param
 
 
@@ -40,7 +41,7 @@ class Mechanics(eqx.Module):
         # states y, y'/w0 with the forcing's present value and its slope a step appended: one matrix exponential is exact;
         # y' itself would make entries of w0^2, too large for it where a step holds many periods of a stiff stack
         rows = [[zero, w0, zero, zero], [-w0, -2 * self.xi * w0, w0, zero], [zero, zero, zero, one / dt], [zero] * 4]
-        full = jax.scipy.linalg.expm(dt * jnp.stack([jnp.stack(r) for r in rows]))
+        full = exponential_of(dt * jnp.stack([jnp.stack(r) for r in rows]))
         return full[:2, :2], full[:2, 2], full[:2, 3]
 
     def _march(self, u, dt):
