@@ -22,6 +22,7 @@ SEEN = 1e-4  # of the span: less noise hides no crest
 NOISY = 1.5  # counts of noise, rms: from here on values seldom come back
 TIED, TIED_MORE = 8, 4.0  # samples that equal the extreme, and how many times as often as a level near it
 STUCK = 10  # equal samples in a row
+WAVY = 8.0  # deviations of chi2 from what noise leaves of a flat plateau in means of eight samples
 CORNER_IN_NOISE = 0.65  # a plateau of many tolerances' depth has lost the slow part of a round approach
 
 
@@ -111,7 +112,8 @@ def clipped_crest(x: np.ndarray, drive: np.ndarray | None = None) -> tuple[int, 
         cut = [run for run in runs if _is_cut(x, *run, max(tolerance, step, 3 * noise), max(0.5 * step, noise), corner)]
         if 2 * len(cut) >= len(runs) and cut:
             best = max(cut, key=lambda run: run[1])
-            if not _holds_elsewhere(x, best[1], tolerance, span) and not _rests(drive, *best):
+            wavy = _is_wavy(x, cut, max(0.5 * step, noise))
+            if not wavy and not _holds_elsewhere(x, best[1], tolerance, span) and not _rests(drive, *best):
                 return best
     return None
 
@@ -164,6 +166,24 @@ def _is_cut(x, first, length, tolerance, scatter, corner) -> bool:
             return False
         slopes.append(slope)
     return length * slopes[0] * slopes[1] / (2 * sum(slopes)) > ARCH * tolerance
+
+
+def _is_wavy(x, runs, scatter) -> bool:
+    """Whether plateaus have the same hills and dips each time: a reading that folds back, as by fringes, not a limit."""
+    if not scatter:
+        return False
+    length = min(length for _, length in runs)
+    profile = np.mean([x[first + (n - length) // 2 :][:length] for first, n in runs], axis=0)
+    inside = np.flatnonzero(profile > np.median(profile) - 2 * scatter)  # of the flanks what tolerance took in
+    edge = max(2, len(inside) // 20)
+    profile = profile[inside[0] + edge : inside[-1] + 1 - edge]
+    blocks = np.array_split(profile, max(len(profile) // 8, 3))
+    if len(profile) < 4 * len(blocks):
+        return False
+    means, counts = np.array([b.mean() for b in blocks]), np.array([len(b) for b in blocks])
+    level = np.average(means, weights=counts)
+    misfit = float(np.sum(counts * (means - level) ** 2)) * len(runs) / scatter**2
+    return misfit > len(blocks) + WAVY * np.sqrt(2 * len(blocks))
 
 
 def _flanks(depth, first, length):

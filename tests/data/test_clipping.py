@@ -50,6 +50,16 @@ def test_one_period_suffices_wherever_it_begins(start):
     assert np.all(x[at] == 0.8) and length == np.sum(x == 0.8)
 
 
+@pytest.mark.parametrize("phase", np.arange(8) / 8)
+def test_fringes_that_fold_a_crest_are_no_limit(phase):
+    """An interferometer's error of a quarter of its period: the crest is flat but for hills that come back with every period."""
+    rng = np.random.default_rng(3)
+    motion = 20 * np.sin(2 * np.pi * phases(1000, 4))
+    reading = motion + 0.4 * np.sin(2 * np.pi * (motion / 1.6 + phase)) + 0.04 * rng.standard_normal(len(motion))
+    assert not is_clipped(reading)
+    assert is_clipped(np.minimum(motion, 14.0) + 0.04 * rng.standard_normal(len(motion)))
+
+
 def honest(t):
     """Periodic signals that nothing cut, by name."""
     s = np.sin(2 * np.pi * t)
