@@ -19,7 +19,7 @@ from tests.blind.generator.instruments import record
 from tests.blind.generator.strain import settled_play
 from tests.blind.oracle import Sight
 from tests.blind.run import diagnose, run_cases
-from tests.blind.score import coverage, judge, kept_line, read, wilson
+from tests.blind.score import coverage, judge, kept_line, read, read_all, wilson
 from tests.blind.strengths import GROUPS, HIDDEN, OUTSIDE, VISIBLE
 
 FOLDER = Path(__file__).parent / "blind"
@@ -241,3 +241,11 @@ def test_rows_of_another_suite_are_refused(tmp_path):
     assert [case.name for case, *_ in read("val", tmp_path / "rows.jsonl")] == ["val-003"]
     with pytest.raises(SystemExit, match="no case of test"):
         list(read("test", tmp_path / "rows.jsonl"))
+
+
+def test_a_case_counts_once(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).write_text(kept_line("val-003", {"status": 0, "seconds": 1.0}, None) + "\n")
+    assert len(read_all("val", [tmp_path / "one"])) == 1
+    with pytest.raises(SystemExit, match="val-003 stands in .*one and in .*two"):
+        read_all("val", [tmp_path / "one", tmp_path / "two"])

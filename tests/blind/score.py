@@ -88,6 +88,17 @@ def read(suite: str, out: Path):
             yield make_case(suite, int(name.rpartition("-")[2])), diagnosis, done
 
 
+def read_all(suite: str, outs) -> list:
+    """The rows of several folders and files; a case that stands in two is refused: it would count twice."""
+    found = {}
+    for out in outs:
+        for row in read(suite, out):
+            other = found.setdefault(row[0].name, (out, row))[0]
+            if other is not out:
+                raise SystemExit(f"{row[0].name} stands in {other} and in {out}; give one of them")
+    return [row for _, row in found.values()]
+
+
 def _folders(suite, out):
     for k in range(size(suite)):
         folder = out / f"{suite}-{k:03d}"
@@ -287,7 +298,7 @@ def main():
     p.add_argument("--table", type=Path)
     p.add_argument("--keep", type=Path)
     options = p.parse_args()
-    rows = [row for out in options.out for row in read(options.suite, out)]
+    rows = read_all(options.suite, options.out)
     if not rows:
         raise SystemExit(
             f"no finished case of {options.suite} in {options.out[0]}: run python -m tests.blind.run {options.suite} first"
