@@ -148,9 +148,9 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
         cleaned, own, freed = found
         return _examined(cleaned, measured, [*adopted, own], check, freed, (task, adopted))
     free = task.held if zero is None else (*task.held, "sensor.offset")
-    raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
     checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
     plain, candidates = _screened_finer(task, plain, candidates, free)
+    raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
     place = where(plain, candidates, task.recordings, task.bench.output)
     anew = []  # what the diagnosis begins anew with: recordings without a hum that showed beside an effect, or a better plain fit
 

@@ -54,6 +54,15 @@ def test_silent_where_nothing_is_missing(bench):
             "next_experiment", "placebo", "message", "base", "repaired"} == set(content)  # fmt: skip
 
 
+def test_the_base_of_a_diagnosis_is_that_on_the_finer_density_that_was_asked_for(bench):
+    runs, checks = study(bench)
+    coarse = Choices(fine=250, knots=(8, 6), without=tuple(e.name for e in CATALOGUE))
+    found = diagnose(runs, bench, check=checks, choices=coarse)
+    assert found.verdict == "nothing_missing" and found.base.choices.knots > coarse.knots
+    assert f"chi2/N = {found.base.chi2_per_sample:.2f}" in found.message
+    assert found.check[0]["rms_before"] == found.check[0]["rms_after"]
+
+
 def test_names_a_concealed_sensor_filter(bench):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
     asked = {"sensor_lag", "amplifier_lag", "transport_delay", "duffing_stiffness"}  # all of it: the blind suites
