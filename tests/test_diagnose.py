@@ -155,6 +155,56 @@ def test_masses_of_cells_serve_a_final_model_where_they_promise_to_foretell_bett
     assert sorted(levels) == [(level, ("sensor.offset",)) for level in sorted(fits)] and (found and found.excess) == taken
 
 
+@pytest.mark.parametrize(
+    ("chi2n", "cells", "beside", "rough"),
+    [
+        (1.65, {32: (1.32, 60), 40: (1.5, 60)}, None, True),
+        (1.65, {32: (1.5, 60), 40: (1.6, 60)}, None, False),  # physics: cells do not come near the noise
+        (1.5, {32: (1.32, 200), 40: (1.4, 200)}, None, False),  # nor do they foretell better
+        (3.5, {32: (1.3, 60), 40: (1.4, 60)}, None, False),
+        (1.22, {32: (1.26, 60), 40: (1.4, 60)}, 1.17, True),
+        (1.22, {32: (1.26, 60), 40: (1.4, 60)}, 1.05, False),  # the effect takes most of what cells leave
+        (1.1, {32: (1.26, 60), 40: (1.4, 60)}, 1.17, False),  # the effect meets the noise
+    ],
+    ids=["rough", "too much is left", "no better", "far off", "an effect by chance", "an effect", "an effect that meets the noise"],
+)
+def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, chi2n, cells, beside, rough):
+    common = {
+        "spectra": None,
+        "problem": SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy",))),
+        "bench": bench,
+        "actuator": None,
+    }
+
+    def result(value, unknowns, knots=None):
+        return SimpleNamespace(chi2_per_sample=value, data_count=700, unknowns=unknowns, choices=Choices(knots=knots), **common)
+
+    plain, current = result(1.6 if beside else chi2n, 100, (26, 18)), result(chi2n, 100, (26, 18))
+    fits = {level: result(*row) for level, row in cells.items()}
+    monkeypatch.setattr(Task, "fit", lambda task, actuator, choices, **more: fits[choices.level])
+    monkeypatch.setattr(Task, "fit_on", lambda *arguments, **more: result(beside, 61))
+    steps = [trial("mean_field", current, 200.0)] if beside else []
+    reached = Reached(current, steps, {})
+    evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), reached=reached)
+    found = module._on_cells_alone(Task((), bench), evidence)
+    assert (found is not None) == rough
+    assert not rough or (found.raw is found.plain is found.reached.current is fits[32] and not found.reached.steps)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [29, 42], ids=["a hum that is too weak", "null"])
+def test_silent_on_random_cells(tmp_path, number):
+    from magjax.readers import load_recordings
+    from tests.blind.cases import make_case, write_case
+
+    case = make_case("dev", number)
+    assert case.density == "cells" and case.kind in ("null", "decoy")
+    write_case(case, tmp_path)
+    bench = load_bench(str(tmp_path / "bench.toml"))
+    runs, checks = (load_recordings(sorted(map(str, tmp_path.glob(f"{kind}_*.csv"))), bench) for kind in ("fit", "check"))
+    assert diagnose(runs, bench, check=checks).verdict == "nothing_missing"
+
+
 def test_what_scores_or_was_fitted_is_not_absorbed():
     candidates = [scored("quartic_magnetostriction", 22.8, 0.003), scored("linear_strain", 3.0, 0.003), scored("mean_field", 2.0)]
     candidates += [scored("accommodation", 4.0, 0.003), scored("creep", 1.0)]
