@@ -50,6 +50,8 @@ FIT = {
     "recipe": "only with --recipe: T&B Sec. 2.3 on the single tones with the fitted density and f0",
     "bootstrap": "only with --bootstrap: intervals from refits of recordings drawn again (draws in bootstrap.nc)",
     "profile": "only with --profile: intervals of parameters held while all else is fitted again",
+    "reproduce": "the command that made it; in the file, not in what `--json` prints",
+    "versions": "of magjax, jax, numpy and Python, in words; in the file likewise",
 }
 
 DIAGNOSIS = {
@@ -78,6 +80,8 @@ DIAGNOSIS = {
     "placebo": "null, or how often the same search cries wolf on simulations of the final model (--placebo)",
     "base": "the content of fit.json for the model without the effects",
     "repaired": "the same with them; null where nothing was added",
+    "reproduce": "the command that made it; in the file, not in what `--json` prints",
+    "versions": "of magjax, jax, numpy and Python, in words; in the file likewise",
 }
 
 # what only a finished diagnosis fills; tests hold a real one against these

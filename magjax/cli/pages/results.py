@@ -51,9 +51,11 @@ def specimens() -> dict:
     fitted = specimen(
         FitResult, actuator=actuator, bench=bench, estimates=(estimate,), recordings=(row,), correlations={"coil.R_eddy~mechanics.xi": 0.0},
     )  # fmt: skip
+    written = {"reproduce": "", "versions": ""}
     found = specimen(Diagnosis, candidates=(specimen(Candidate, name="creep"),), base=fitted, repaired=fitted, check_left_out=("",))
     return {
-        "fit": {**fitted.as_dict(), "check": [], "check_left_out": [], "recipe": None, "bootstrap": None, "profile": None}, "diagnosis": {**found.as_dict(), "base": None, "repaired": None},
+        "fit": {**fitted.as_dict(), "check": [], "check_left_out": [], "recipe": None, "bootstrap": None, "profile": None} | written,
+        "diagnosis": {**found.as_dict(), "base": None, "repaired": None} | written,
         "model": model_as_dict(actuator, bench), "check": Card("", {"samples": ""}, ()).as_dict(),
     }  # fmt: skip
 
