@@ -1,7 +1,7 @@
 """The joint fit: all recordings at once, every free parameter, to the noise.
 
-Harmonics in, the steps of the projected Levenberg-Marquardt solver, roughness weights by evidence
-(MacKay) while it runs, the residual on a finer grid than the Jacobian.
+Harmonics in, the steps of a bounded Levenberg-Marquardt solver behind optimistix's interface, roughness weights by
+evidence (MacKay) between them, the residual on a finer grid than the Jacobian.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import structural_rank
 from magjax.programs import kept
 
 from .model import Layout, Predictor, Target, whitened
-from .solver import CHUNK, damped_step, pushed
+from .solver import CHUNK, SteppedLevenbergMarquardt, cost_of, pushed
 from .together import together
 
 WEIGHT_RANGE = (1e-3, 1e9)
@@ -30,8 +30,6 @@ AT_END = (
     5e-4,
 )  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
 PROMISED = 1e-2  # share of half chi2 that may still be promised there: a kink, or the coarse Jacobian, keeps it
-CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
-BEND = 0.2  # of the step, over which its curvature is taken
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,99 +238,64 @@ def prior_matrix(problem: Problem, weights) -> np.ndarray:
     return matrix
 
 
-def bent_step(problem: Problem, z, new, residual, J, normal, damping):
-    """The step from z to `new`, bent as the valley is: geodesic acceleration (Transtrum, Sethna 2012), central differences."""
-    delta = new - z
-    curvature = (data_residual(problem, z + BEND * delta) - 2 * residual + data_residual(problem, z - BEND * delta)) / BEND**2
-    lower, upper = problem.layout.bounds
-    free = np.flatnonzero((new > lower) & (new < upper))
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
-    matrix = normal[np.ix_(free, free)] * scale[:, None] * scale + damping * np.eye(len(free))
-    bent = new.copy()
-    bent[free] -= 0.5 * scale * np.linalg.solve(matrix + 1e-12 * np.eye(len(free)), scale * (J[:, free].T @ curvature))
-    return np.clip(bent, lower, upper)
-
-
-def cost_of(residual, z, prior) -> float:
-    """Half of chi2 and of what the priors add; infinite where a step has left all reason."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return 0.5 * float(residual @ residual + z @ prior @ z)
-
-
 def solve(
     problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None, target: float = np.inf
 ) -> Solution:
     """Minimise from z, one Jacobian and a few trial dampings a step.
 
-    The steps are those of `ProjectedLevenbergMarquardt`, driven from Python with the two compiled functions that the
-    screening uses too (half the compilation). `progress(step, chi2 per datum)` is called after each Jacobian; Ctrl-C
-    keeps what was reached. `target`: a chi2 that must be reached to be of use; once four times the promised fall cannot
-    lead there the iteration ends.
+    An optimistix solver whose steps are asked for one by one, for the roughness weights move between them.
+    `progress(step, chi2 per datum)` is called after each Jacobian; Ctrl-C keeps what was reached. `target`: a chi2 that must
+    be reached to be of use; once four times the promised fall cannot lead there the iteration ends.
     """
     layout, count = problem.layout, problem.data_count
-    bounds = layout.bounds
+    solver = SteppedLevenbergMarquardt(layout.bounds)
     z, weights = np.asarray(z, float), np.asarray(weights, float)
-    prior = prior_matrix(problem, weights)
-    begin, converged, interrupted, taken, damping, decrement, held = time.perf_counter(), False, False, 0, 1e-2, np.inf, np.inf
-    residual = data_residual(problem, z)
-    chi2 = float(residual @ residual)
-    cost = 0.5 * (chi2 + z @ prior @ z)
-    information, path, gains = np.zeros_like(prior), [chi2], []
+    posed = {"jacobian": lambda z: data_jacobian(problem, z), "prior": prior_matrix(problem, weights)}
+
+    def residual_at(z, _):
+        return data_residual(problem, z), None
+
+    def weighed(z, state, new):
+        """The state under other roughness weights."""
+        posed["prior"] = prior_matrix(problem, new)
+        return dataclasses.replace(state, cost=cost_of(state.residual, z, posed["prior"]))
+
+    begin, converged, interrupted, taken, held = time.perf_counter(), False, False, 0, np.inf
+    state = solver.init(residual_at, z, None, posed, None, None, frozenset())
+    path, gains = [state.chi2], []
     try:
         for taken in range(1, max_jacobians + 1):
-            J = data_jacobian(problem, z)
-            information = J.T @ J
-            normal, gradient = information + prior, J.T @ residual + prior @ z
-            good = False
-            for _ in range(8):
-                new, predicted = damped_step(normal, gradient, z, damping, bounds)
-                trial = data_residual(problem, new)
-                new_cost = cost_of(trial, new, prior)
-                ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0
-                if ratio < CURVED and float(predicted) > 1e-4 * cost + 1:
-                    bent = bent_step(problem, z, new, residual, J, normal, damping)
-                    other = data_residual(problem, bent)
-                    other_cost = cost_of(other, bent, prior)
-                    if not other_cost >= new_cost:
-                        new, trial, new_cost, ratio = bent, other, other_cost, (cost - other_cost) / float(predicted)
-                good = bool(np.isfinite(new_cost) and ratio > 1e-3)
-                damping = max(damping * (0.15 if ratio > 0.5 else 1.0 if good else 6.0), 1e-9)
-                if good or float(predicted) < 1e-6 * cost + 1e-3:
-                    break
-            decrement = float(damped_step(normal, gradient, z, 1e-9, bounds)[1])
-            gains.append(cost - new_cost if good else 0.0)
-            if good:
-                z, residual, cost = new, trial, new_cost
-            chi2 = float(residual @ residual)
+            z, state, _ = solver.step(residual_at, z, None, posed, state, frozenset())
+            gains.append(state.gained)
+            chi2 = state.chi2
             if progress is not None:
                 progress(taken, chi2 / count)
             path.append(chi2)
-            if taken > 3 and chi2 - 8 * decrement > target:
+            if taken > 3 and chi2 - 8 * state.decrement > target:
                 break
             if chi2 / count > FAR and len(path) > STALLED and chi2 > (1 - STALL) * path[-STALLED]:
                 break
-            stalled = len(gains) >= AT_END[0] and sum(gains[-AT_END[0] :]) < max(AT_END[1], AT_END[2] * cost)
-            settled = stalled or decrement < 0.5 + 1e-4 * cost
+            stalled = len(gains) >= AT_END[0] and sum(gains[-AT_END[0] :]) < max(AT_END[1], AT_END[2] * state.cost)
+            settled = stalled or bool(solver.terminate(residual_at, z, None, posed, state, frozenset())[0])
             if evidence and chi2 / count < FAR:
-                found = evidence_weights(layout, z, normal, weights)
+                found = evidence_weights(layout, z, state.information + posed["prior"], weights)
                 moved = np.max(np.abs(np.log(found / weights)), initial=0.0)
                 weights = weights * np.clip(found / weights, 1 / 30, 30)
-                prior = prior_matrix(problem, weights)
-                cost = 0.5 * (chi2 + z @ prior @ z)
+                state = weighed(z, state, weights)
                 settled = stalled or settled and moved < 0.3
             elif evidence and settled:
                 # settled far above the noise: as long as the prior, not the physics, holds it there, let go
                 if chi2 < 0.8 * held and weights.max() > 10 * WEIGHT_RANGE[0]:
                     held, weights, settled, gains = chi2, np.maximum(weights / 30, WEIGHT_RANGE[0]), False, []
-                    prior = prior_matrix(problem, weights)
-                    cost = 0.5 * (chi2 + z @ prior @ z)
-            if settled or not good:
-                converged = decrement < 1.0 + (PROMISED if stalled else 1e-3) * cost
-                if settled or not evidence or decrement < 1.0:
+                    state = weighed(z, state, weights)
+            if settled or not state.good:
+                converged = state.decrement < 1.0 + (PROMISED if stalled else 1e-3) * state.cost
+                if settled or not evidence or state.decrement < 1.0:
                     break
-                damping = min(damping, 1e2)
+                state = dataclasses.replace(state, damping=min(state.damping, 1e2))
     except KeyboardInterrupt:
         converged, interrupted = False, True
     # under the weights that are returned: they may have moved after the last step
-    normal = information + prior
-    return Solution(z, weights, chi2, cost, decrement, normal, taken, converged, time.perf_counter() - begin, interrupted)
+    normal = state.information + posed["prior"]
+    seconds = time.perf_counter() - begin
+    return Solution(z, weights, state.chi2, state.cost, state.decrement, normal, taken, converged, seconds, interrupted)

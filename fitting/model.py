@@ -285,13 +285,6 @@ def whitened(lines, target: Target):
     return jnp.concatenate([misfit.real.ravel(), misfit[:, 1:].imag.ravel()])
 
 
-def prior_rows(layout: Layout, z, target: Target):
-    """Residuals of the prior: roughness of the density, and the stated priors of parameters."""
-    n = layout.density_unknowns
-    rows = [jnp.sqrt(target.weights[k]) * (D @ z[:n]) for k, D in enumerate(layout.penalties)]
-    return jnp.concatenate([*rows, target.priors * z[n + 1 :], target.bottom_prior * z[n : n + 1]])
-
-
 def make_start_actuator(template, basis: DensityBasis, rest=None):
     """`template` with a plane that fits the basis (uniform masses)."""
     hysteresis = Preisach(basis.masses(basis.flat), basis.low, basis.high, 0.0, rest=rest)

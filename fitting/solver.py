@@ -17,6 +17,8 @@ from jaxtyping import Array
 from scipy.linalg import cho_factor, cho_solve
 
 CHUNK = 40
+CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
+BEND = 0.2  # of the step, over which its curvature is taken
 
 
 class ProjectedState(eqx.Module):
@@ -86,6 +88,95 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         return y, aux, {"decrement": state.decrement, "normal": state.normal}
+
+
+class SteppedState(eqx.Module):
+    """What a step from Python carries: damping, cost (half of chi2 and of what the prior adds), the data's residual and J'J,
+    the fall that is still promised, the fall of the last step, and whether one was taken."""
+
+    damping: float
+    cost: float
+    residual: np.ndarray
+    information: np.ndarray
+    decrement: float
+    gained: float
+    good: bool
+
+    @property
+    def chi2(self) -> float:
+        """Of the data alone."""
+        return float(self.residual @ self.residual)
+
+
+class SteppedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """The same method for a caller that takes its steps one by one, in NumPy: `fn` and `options["jacobian"]`, a function of
+    the unknowns, are compiled programs, and there is nothing else to compile.
+
+    `options["prior"]`: the curvature of a quadratic prior, which adds y'Py / 2 to half the sum of squares. A step whose fall
+    is far from what it promised is bent along the valley. For `optimistix.least_squares`, which traces the step, take
+    `ProjectedLevenbergMarquardt`.
+    """
+
+    bounds: Any
+    rtol: float = 1e-4
+    atol: float = 0.5
+    norm: Any = optx.max_norm
+    trials: int = 8
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        residual, prior = fn(y, args)[0], options["prior"]
+        return SteppedState(1e-2, cost_of(residual, y, prior), residual, np.zeros_like(prior), np.inf, 0.0, False)
+
+    def step(self, fn, y, args, options, state, tags):
+        prior, residual, cost, damping = options["prior"], state.residual, state.cost, state.damping
+        J = options["jacobian"](y)
+        information = J.T @ J
+        normal, gradient = information + prior, J.T @ residual + prior @ y
+        good = False
+        for _ in range(self.trials):
+            new, predicted = damped_step(normal, gradient, y, damping, self.bounds)
+            trial = fn(new, args)[0]
+            new_cost = cost_of(trial, new, prior)
+            ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0
+            if ratio < CURVED and float(predicted) > 1e-4 * cost + 1:
+                bent = bent_step(lambda z: fn(z, args)[0], self.bounds, y, new, residual, J, normal, damping)
+                other = fn(bent, args)[0]
+                other_cost = cost_of(other, bent, prior)
+                if not other_cost >= new_cost:
+                    new, trial, new_cost, ratio = bent, other, other_cost, (cost - other_cost) / float(predicted)
+            good = bool(np.isfinite(new_cost) and ratio > 1e-3)
+            damping = max(damping * (0.15 if ratio > 0.5 else 1.0 if good else 6.0), 1e-9)
+            if good or float(predicted) < 1e-6 * cost + 1e-3:
+                break
+        decrement = float(damped_step(normal, gradient, y, 1e-9, self.bounds)[1])
+        if not good:
+            return y, SteppedState(damping, cost, residual, information, decrement, 0.0, False), None
+        return new, SteppedState(damping, new_cost, trial, information, decrement, cost - new_cost, True), None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        return state.decrement < self.atol + self.rtol * state.cost, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return y, aux, {"decrement": state.decrement, "normal": state.information + options["prior"]}
+
+
+def cost_of(residual, y, prior) -> float:
+    """Half of chi2 and of what a quadratic prior adds; infinite where a step has left all reason."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return 0.5 * float(residual @ residual + y @ prior @ y)
+
+
+def bent_step(residual_at, bounds, y, new, residual, J, normal, damping):
+    """The step from y to `new`, bent as the valley is: geodesic acceleration (Transtrum, Sethna 2012), central differences."""
+    delta = new - y
+    curvature = (residual_at(y + BEND * delta) - 2 * residual + residual_at(y - BEND * delta)) / BEND**2
+    lower, upper = bounds
+    free = np.flatnonzero((new > lower) & (new < upper))
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
+    matrix = normal[np.ix_(free, free)] * scale[:, None] * scale + damping * np.eye(len(free))
+    bent = new.copy()
+    bent[free] -= 0.5 * scale * np.linalg.solve(matrix + 1e-12 * np.eye(len(free)), scale * (J[:, free].T @ curvature))
+    return np.clip(bent, lower, upper)
 
 
 def damped_step(normal, gradient, y, damping, bounds):

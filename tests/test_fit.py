@@ -19,7 +19,7 @@ from fitting.density import DensityBasis, cell_basis, hat_basis
 from fitting.fit import finer_than, fit, guessed, loose
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
-from fitting.solver import ProjectedLevenbergMarquardt, bounded_minimum
+from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import agreeing, operator_rows, unfold
 from magjax.bench import load_bench
@@ -236,6 +236,30 @@ def test_solver_runs_behind_optimistix():
     assert float(solution.value[0]) == pytest.approx(1.0, abs=0.01)
 
 
+def test_steps_asked_for_one_by_one_end_where_optimistix_ends():
+    """The fit's own solver through the same interface: init, step, terminate, its prior beside the residual."""
+    target, weight = np.asarray([1.0, -2.0, 3.0]), 1e-4 * np.eye(3)
+
+    def residual(y, args):
+        return np.exp(0.3 * y) - np.exp(0.3 * target), None
+
+    def traced(y, args):
+        return jnp.concatenate([jnp.exp(0.3 * y) - jnp.exp(0.3 * target), 1e-2 * y])
+
+    bounds = np.asarray([0.0, 0.0, -np.inf]), np.asarray([np.inf, np.inf, 2.5])
+    solver = SteppedLevenbergMarquardt(bounds, rtol=0.0, atol=1e-14)
+    options = {"jacobian": lambda y: np.diag(0.3 * np.exp(0.3 * y)), "prior": weight}
+    y, steps, tags = np.ones(3), 0, frozenset()
+    state = solver.init(residual, y, None, options, None, None, tags)
+    while not solver.terminate(residual, y, None, options, state, tags)[0] and steps < 50:
+        before = state.cost
+        y, state, _ = solver.step(residual, y, None, options, state, tags)
+        steps += 1
+        assert state.gained == pytest.approx(before - state.cost)
+    other = optx.least_squares(traced, ProjectedLevenbergMarquardt(bounds, rtol=0.0, atol=1e-14), jnp.ones(3), max_steps=50)
+    assert steps < 20 and y == pytest.approx(np.asarray(other.value), abs=1e-6) and list(y[1:]) == [0.0, 2.5]
+
+
 def test_solver_behind_optimistix_bears_hundreds_of_unknowns():
     """As `scipy.optimize.nnls` ends; with a call back to NumPy in the step this waited forever."""
     rng = np.random.default_rng(0)
@@ -377,24 +401,22 @@ def test_lambda_s_freed_with_a_prior_comes_back_and_the_valley_is_told(recording
     assert "a valley" in got.message and "lambda_s" in got.message
 
 
-def test_a_bent_step_follows_the_valley(monkeypatch):
+def test_a_bent_step_follows_the_valley():
     """r = (50 (a b - 1), a - 3): along a b = 1 a straight step leaves the valley, a bent one hardly."""
-    import fitting.joint as module
 
-    def residual(problem, z):
+    def residual(z):
         return np.array([50 * (z[0] * z[1] - 1), z[0] - 3, 0.0])
 
-    monkeypatch.setattr(module, "data_residual", residual)
-    problem = SimpleNamespace(layout=SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf))))
+    bounds = np.full(2, -np.inf), np.full(2, np.inf)
     z, damping = np.array([1.0, 1.0]), 1e-3
     J = np.array([[50 * z[1], 50 * z[0]], [1.0, 0.0], [0.0, 0.0]])
-    r, normal = residual(problem, z), J.T @ J
+    r, normal = residual(z), J.T @ J
     new = z - np.linalg.solve(normal + damping * np.diag(np.diag(normal)), J.T @ r)
-    bent = module.bent_step(problem, z, new, r, J, normal, damping)
-    straight_cost, bent_cost, cost = (float(np.sum(residual(problem, x) ** 2)) for x in (new, bent, z))
+    bent = bent_step(residual, bounds, z, new, r, J, normal, damping)
+    straight_cost, bent_cost, cost = (float(np.sum(residual(x) ** 2)) for x in (new, bent, z))
     assert straight_cost > 5 * cost and bent_cost < 0.75 * cost and bent[0] > 1.2
-    problem.layout.bounds = np.zeros(2), np.full(2, np.inf)
-    held = module.bent_step(problem, np.array([1.0, 0.1]), np.array([1.2, 0.0]), r, J, normal, damping)
+    bounds = np.zeros(2), np.full(2, np.inf)
+    held = bent_step(residual, bounds, np.array([1.0, 0.1]), np.array([1.2, 0.0]), r, J, normal, damping)
     assert held[1] == 0.0  # what the step has put at its bound stays there
 
 
@@ -423,14 +445,14 @@ def test_parameters_stay_between_their_bounds(monkeypatch):
 @pytest.mark.parametrize("most", [(4, 1.0, 5e-4), (99, 1.0, 5e-4)], ids=["as it is", "without the rule"])
 def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
     """A kink whose derivative promises a fall that no step brings: nothing is gained by the rest of the Jacobians."""
-    from fitting import joint
+    from fitting import joint, solver
 
     kinked = lambda z: np.concatenate([10.0 * (z - 1.0), 40.0 + 6.0 * np.abs(z)])  # noqa: E731
     sloped = lambda z: np.concatenate([10.0 * np.eye(2), 6.0 * np.eye(2)])  # noqa: E731  one side's, on both
     monkeypatch.setattr(joint, "data_residual", lambda problem, z: kinked(np.asarray(z)))
     monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: sloped(z))
     monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(2))
-    monkeypatch.setattr(joint, "bent_step", lambda problem, z, new, *rest: new)
+    monkeypatch.setattr(solver, "bent_step", lambda residual_at, bounds, y, new, *rest: new)
     monkeypatch.setattr(joint, "evidence_weights", lambda layout, z, normal, weights: weights)
     monkeypatch.setattr(joint, "AT_END", most)
     problem = SimpleNamespace(layout=SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf))), data_count=1000)

@@ -9,8 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..joint import Problem, cost_of, data_jacobian, data_residual, data_residuals, prior_matrix
-from ..solver import damped_step
+from ..joint import Problem, data_jacobian, data_residual, data_residuals, prior_matrix
+from ..solver import cost_of, damped_step
 
 BATCH = 10  # refits side by side: twice as many are slower, a draw, for their Everett tables leave the cache
 CHORDS = 6  # steps with one Jacobian
