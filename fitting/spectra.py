@@ -2,7 +2,7 @@
 
 A record of whole periods is reduced to its reading at the harmonics 0..H of the fundamental (least squares, so that
 periods need not divide the sampling), its drive to the significant lines, and everything else to a noise spectrum
-S(f) = white + flicker/f (or /f^2), estimated from the bins between the harmonics and pooled over recordings.
+S(f) = white + flicker/f (or /f^2), estimated from the bins between the harmonics of all recordings.
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 HARMONICS = 40
 DRIFT_ZERO = 0.25  # of a drift's size: where it had begun is not known
 LOW_ORDERS = 10  # of a converter's integral nonlinearity
+LIKELIER = 4.0  # logarithm of a likelihood, by which another law of the noise must be the better
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,27 +202,42 @@ def estimate_noise(spectra, quantum: float = 0.0) -> Noise:
     return dataclasses.replace(best, white=max(best.white, quantum**2 / 12))
 
 
+def pooled_noise(spectra):
+    """The noise of all recordings by one law, a function from a spectrum to its `Noise`: the colour goes by frequency, or,
+    where that is likelier, by frequency over the sampling rate, so that it moves with the rate (noise of a converter or of
+    its clock; noise made record by record)."""
+    common = estimate_noise(spectra)
+    moving = estimate_noise([dataclasses.replace(s, between_f=s.between_f * s.dt) for s in spectra])
+
+    def moved(s):
+        return dataclasses.replace(moving, flicker=moving.flicker / s.dt**moving.slope)
+
+    likelier = _unlikeliness(spectra, map(moved, spectra)) < _unlikeliness(spectra, [common] * len(spectra)) - LIKELIER
+    return moved if likelier else lambda s: common
+
+
+def _unlikeliness(spectra, noises) -> float:
+    """Minus the logarithm of Whittle's likelihood of what lies between the harmonics, a noise for each recording."""
+    densities = [noise.density(s.between_f) for s, noise in zip(spectra, noises, strict=True)]
+    return sum(float(np.sum(np.log(d) + s.between_power / d)) for s, d in zip(spectra, densities, strict=True))
+
+
 def with_noise(spectra) -> tuple:
-    """The spectra with their noise: pooled, or each its own where the bins between the harmonics say that they differ.
+    """The spectra with their noise: by one law for all, or each its own where the bins between the harmonics say that they differ.
 
     They do where their likelihood rises by 40 a recording, or by 12 with levels more than twofold apart (noise in
     proportion to loops of different size): pooling these would double the errors of the parameters. What is left of
     drifts that differ, differs too: there 6 are enough.
     """
-    pooled = estimate_noise(spectra)
-    own = []
-    gain = 0.0
-    for s in spectra:
-        if len(s.between_f) < 40:
-            return tuple(dataclasses.replace(x, noise=pooled) for x in spectra)
-        mine = estimate_noise([s])
-        own.append(mine)
-        a, b = pooled.density(s.between_f), mine.density(s.between_f)
-        gain += float(np.sum(np.log(a) + s.between_power / a - np.log(b) - s.between_power / b))
-    levels = [float(np.mean(s.between_power)) for s in spectra]
-    least = 6 if any(s.drift for s in spectra) else 40
-    differ = gain > least * len(spectra) or (gain > 12 * len(spectra) and max(levels) > 2 * min(levels))
-    return tuple(dataclasses.replace(s, noise=n if differ else pooled) for s, n in zip(spectra, own, strict=True))
+    noises = list(map(pooled_noise(spectra), spectra))
+    if all(len(s.between_f) >= 40 for s in spectra):
+        own = [estimate_noise([s]) for s in spectra]
+        gain = _unlikeliness(spectra, noises) - _unlikeliness(spectra, own)
+        levels = [float(np.mean(s.between_power)) for s in spectra]
+        least = 6 if any(s.drift for s in spectra) else 40
+        if gain > least * len(spectra) or (gain > 12 * len(spectra) and max(levels) > 2 * min(levels)):
+            noises = own
+    return tuple(dataclasses.replace(s, noise=n) for s, n in zip(spectra, noises, strict=True))
 
 
 def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:

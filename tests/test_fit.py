@@ -294,6 +294,27 @@ def test_noise_is_found_between_the_harmonics():
     assert estimate_noise(spectra).rms == pytest.approx(30e-9, rel=0.05)
 
 
+@pytest.mark.parametrize("by_rate", [True, False], ids=["by the sampling rate", "by frequency"])
+def test_the_colour_of_the_noise_goes_by_frequency_or_by_the_sampling_rate(by_rate):
+    """Flicker of records made one by one moves with their rate; by frequency it would be missed tenfold at the low orders."""
+    rng = np.random.default_rng(6)
+    spectra, true = [], []
+    for f in (5, 20, 80, 320):
+        n, dt = 2000, 1 / (500 * f)
+        frequencies = np.fft.rfftfreq(n, dt)
+        flicker = 1e-18 * (0.02 / (frequencies[1:] * dt) if by_rate else 200.0 / frequencies[1:])
+        white = np.fft.rfft(rng.standard_normal(n))
+        white[1:] *= np.sqrt(4e-16 + 1e2 * flicker)
+        t = dt * np.arange(n)
+        drive = np.sin(2 * np.pi * f * t)
+        channels = {"current": drive, "displacement": 1e-5 * drive**3 + np.fft.irfft(white, n)}
+        spectra.append(reduce_recording(Recording(t, channels, name=str(f)), "current", "displacement"))
+        true.append(4e-16 + 1e2 * flicker[3])  # at the fundamental: the fourth bin of the record
+    found = [s.noise.density(s.frequency) for s in with_noise(spectra)]
+    assert np.log(np.asarray(found) / true) == pytest.approx(np.zeros(4), abs=0.35)
+    assert np.log(estimate_noise(spectra).density(5.0) / true[0]) == pytest.approx(0.0, abs=0.35) or by_rate
+
+
 @pytest.mark.parametrize("levels", [(30e-9, 60e-9), (30e-9, 33e-9)])
 def test_noise_is_each_recordings_own_where_it_differs_and_pooled_where_not(levels):
     rng = np.random.default_rng(4)
