@@ -139,16 +139,21 @@ def settled(task, base, trial, excess, target: float = np.inf) -> Trial:
     if not result.converged and chi2_of(result) < target:
         result = task.fit_on(result, result.actuator, choices=result.choices, spectra=base.spectra, target=target)
         trial = credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
-    return _in_detail(task, base, trial, excess)
+    return _gone_on(task, base, trial, excess, _further_starts(base, trial), MISFIT)
 
 
-def _in_detail(task, base, trial, excess) -> Trial:
-    """The trial with the details of its effect's law, and from elsewhere, where it takes a part of the misfit and leaves some, and
-    these take more."""
+def in_detail(task, base, trial, excess) -> Trial:
+    """The trial with the details of its effect's law free whatever it leaves, if these take enough more."""
+    return _gone_on(task, base, trial, excess, _details(trial), 0.0)
+
+
+def _gone_on(task, base, trial, excess, starts, above) -> Trial:
+    """The trial, or the best that other `starts` of its effect lead to, where it takes a part of the misfit and leaves a chi2/N
+    `above` this, and they take enough more."""
     best = trial
-    for start, of in _further_starts(base, trial):
+    for start, of in starts:
         result = best.result
-        if not (best.explained_share > DETAIL_SHARE and result.chi2_per_sample > MISFIT):
+        if not (best.explained_share > DETAIL_SHARE and result.chi2_per_sample > above):
             break
         same = {"choices": result.choices, "spectra": base.spectra}
         finer = task.fit_on(of, of.actuator.with_effect(start), **same)
@@ -159,11 +164,16 @@ def _in_detail(task, base, trial, excess) -> Trial:
     return best
 
 
+def _details(trial):
+    """The effect of a trial with the details of its law, and the fit to go on from."""
+    detailed = trial.result.actuator.effect(trial.name).in_detail()
+    return [(detailed, trial.result)] if detailed is not None else []
+
+
 def _further_starts(base, trial):
-    """Effects to begin a further fit with, each with the fit to go on from."""
+    """Effects to begin a further fit with, each with the fit to go on from: with details, and from elsewhere."""
     effect = trial.result.actuator.effect(trial.name)
-    detailed = effect.in_detail()
-    return [(detailed, trial.result)] * (detailed is not None) + [(other, base) for other in effect.elsewhere()]
+    return _details(trial) + [(other, base) for other in effect.elsewhere()]
 
 
 def credited(candidate, result, base, effect, excess) -> Trial:

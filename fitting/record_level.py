@@ -14,7 +14,7 @@ from .spectra import fit_lines, reduce_recording, with_noise
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
 CLEAR_HUM, LEAST_HUM = 25.0, 0.25  # chi2 that hum of a size would take between the harmonics, and the share that must show
-OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record by itself, and the share of records that must show it
+OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record alone, and the share of the longer ones that must show it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +119,9 @@ def _own_drifts(spectra, common: float) -> RecordEffect | None:
     """Drift of each record by itself, where that serves better (BIC) than the `common` rate, scored by z; None elsewhere."""
     gains, fits = zip(*(drift_of(s) for s in spectra), strict=True)
     extra, count = 2 * len(spectra), sum(s.samples for s in spectra)
-    shown = np.mean(np.asarray(gains) > OWN_GAIN)  # a hum looks like a drift in short records only
+    # short records show none; a hum looks like one in them alone
+    long = np.asarray([s.samples * s.dt for s in spectra])
+    shown = np.mean(np.asarray(gains)[long >= np.median(long)] > OWN_GAIN)
     if shown < OWN_SHARE or sum(gains) - common**2 < extra * np.log(count):
         return None
     ends = np.array([f[-1] / (s.dt * s.samples) for f, s in zip(fits, spectra, strict=True)])

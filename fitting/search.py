@@ -25,6 +25,7 @@ from .attribute import (
     credited,
     excess_of,
     family,
+    in_detail,
     leaders,
     of_one_family,
     rivals_of,
@@ -48,6 +49,7 @@ IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for
 NOTHING = 2.0  # standard errors within which an amplitude is none
 FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
 NEAR_SHARE = 0.25  # of an early effect's fall, within which too
+NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
 
@@ -158,7 +160,28 @@ def _trials(task, current, top, candidates, excess) -> list[Trial]:
         like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]
     for k in range(0, len(like), SIDE_BY_SIDE):
         attempt(like[k : k + SIDE_BY_SIDE])
-    return trials
+    return _on_equal_terms(task, current, trials, excess)
+
+
+def _on_equal_terms(task, current, trials, excess) -> list[Trial]:
+    """The trials; of those that meet the noise and come near the best, each with the details of its law.
+
+    Where the noise is met nobody asks for details, and a law with more shapes wins by the form of the right one's.
+    """
+    good = [t for t in trials if t.physical and t.drop > MIN_DROP]
+    best = min(good, key=lambda t: t.bic_change, default=None)
+    if best is None or best.result.chi2_per_sample > MISFIT:
+        return trials
+    near = best.bic_change + max(2 * TIE, NEAR_IN_DETAIL * best.drop)
+    near = [t for t in good if t.bic_change < near and t.result.chi2_per_sample < MISFIT]
+    if len(near) < 2:
+        return trials
+
+    def detailed(t):
+        return lambda say: in_detail(task.on(progress=say), current, t, excess)
+
+    found = dict(zip(map(id, near), together([detailed(t) for t in near], task.progress), strict=True))
+    return [found.get(id(t), t) for t in trials]
 
 
 def _to_the_end(task, base, candidate, excess):

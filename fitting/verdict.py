@@ -34,6 +34,8 @@ DOMINANT_TEXT = " What is left is the form of its law, or something weaker besid
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
+CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
+CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
@@ -211,6 +213,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         found = _attributed(evidence, common, effects, swap, asked)
     form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
     form += "".join(ZEROS_TEXT.format(e.amplitude) for e, _ in evidence.adopted if e.shapes.get("zeros"))
+    form += CREEPS_TEXT if any(_creeps_on(e, evidence) for e, _ in evidence.adopted) else ""
     form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
 
@@ -272,6 +275,8 @@ def _found(evidence):
     last group."""
     effects, groups, sizes, last = [], [], {}, []
     for effect, rivals in evidence.adopted:
+        if _creeps_on(effect, evidence):
+            continue
         same = next((e for e in effects if e["name"] == effect.name), None)
         if same:  # within recordings and between them
             same["parameters"] |= _record_row(effect)["parameters"]
@@ -288,6 +293,20 @@ def _found(evidence):
         else:
             effects.append(_effect_row(best, good, evidence.raw, evidence.reached.current))
     return effects, groups, sizes, last
+
+
+def _creeps_on(effect, evidence) -> bool:
+    """Whether a drift within the records is a creep that was found, going on: all but a fifth of it after the mean displacement,
+    and less than a decade of it."""
+    actuator = evidence.reached.current.actuator
+    found = "creep" in {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
+    if not found or effect.name not in ("zero_drift", "thermal_drift") or not effect.columns:
+        return False
+    scale = 1.0 if effect.shapes.get("own") else effect.amplitude
+    drifts = scale * np.asarray([column[-1] - column[0] for column in effect.columns])
+    means = np.asarray([s.reading[0].real for s in evidence.raw.spectra])
+    after = np.sum(drifts * means) > CREEPS_AFTER * np.sum(np.abs(drifts * means))
+    return bool(after and np.all(np.abs(drifts) < float(actuator.effect("creep").gain) * np.abs(means)))
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:

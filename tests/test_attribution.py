@@ -9,12 +9,13 @@ import pytest
 import fitting.attribute
 import fitting.search
 from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of
+from fitting.record_level import RecordEffect
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
 from fitting.uncertainty import Estimate
-from fitting.verdict import Evidence, _sizes, dominant, first_alone, too_little, unconfirmed
+from fitting.verdict import Evidence, _creeps_on, _sizes, dominant, first_alone, too_little, unconfirmed
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -512,3 +513,43 @@ def test_details_of_a_law_that_were_held_are_no_size():
     estimates.append(Estimate("effects.creep.gain", 0.1, 0.01, "1", "", True, 0.0))
     sizes = _sizes("excess_loss", SimpleNamespace(estimates=estimates))
     assert {n: (p["value"], p["stderr"]) for n, p in sizes.items()} == {"k": (26.0, 1.1), "rate_knee": (3.8, 2.0)}
+
+
+def test_rivals_that_meet_the_noise_are_compared_with_the_details_of_their_laws(monkeypatch):
+    """An after-effect of another spectrum lost to a structural damping with more shapes."""
+    asked = []
+
+    def detailed(task, base, t, excess):
+        asked.append(t.name)
+        return trial("magnetic_aftereffect", 0.98, parameters=3) if t.name == "magnetic_aftereffect" else t
+
+    monkeypatch.setattr(fitting.search, "in_detail", detailed)
+    trials = [
+        trial("structural_damping", 1.04, 3), trial("magnetic_aftereffect", 1.09, 2), trial("creep", 1.6), trial("backlash", 1.07, physical=False)
+    ]  # fmt: skip
+    found = fitting.search._on_equal_terms(Task((), None), None, trials, 1000.0)
+    assert sorted(asked) == ["magnetic_aftereffect", "structural_damping"] and names(found) == names(trials)
+    assert found[1].result.chi2_per_sample == 0.98 and found[0] is trials[0]
+    asked.clear()  # nothing to compare with, or the best does not meet the noise: settled by itself
+    assert fitting.search._on_equal_terms(Task((), None), None, trials[:1], 1000.0) == trials[:1]
+    assert fitting.search._on_equal_terms(Task((), None), None, trials[2:3], 1000.0) == trials[2:3] and not asked
+
+
+@pytest.mark.parametrize(
+    ("rates", "gain", "creeps"),
+    [((2e-7, 1e-7, 3e-8), 0.02, True), ((2e-7, -1e-7, 3e-8), 0.02, False), ((2e-7, 1e-7, 3e-8), 0.002, False)],
+    ids=["after the mean", "to and fro", "larger than the creep"],
+)
+def test_a_drift_that_goes_the_way_of_a_creep_is_the_creep(rates, gain, creeps):
+    effect = CLASSES["creep"](gain=gain)
+    actuator = SimpleNamespace(effects=(effect,), effect=lambda name: effect)
+    columns = tuple(r * np.linspace(0, 1, 50) for r in rates)
+    drift = RecordEffect("zero_drift", 20.0, 1e-7, 1e-9, {"own": True}, columns)
+    steps = [(trial("creep", 1.0), (), (), None)]
+    reached = Reached(SimpleNamespace(actuator=actuator), steps, {})
+    spectra = [SimpleNamespace(reading=np.array([3e-5 + 0j])) for _ in rates]
+    evidence = SimpleNamespace(reached=reached, raw=SimpleNamespace(spectra=spectra))
+    assert _creeps_on(drift, evidence) is creeps
+    assert not _creeps_on(dataclasses.replace(drift, name="mains_hum"), evidence)
+    reached.steps.clear()
+    assert not _creeps_on(drift, evidence)

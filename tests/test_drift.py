@@ -59,6 +59,14 @@ def test_drifts_of_the_same_size_in_long_and_short_records_are_each_their_own(sh
     )
 
 
+def test_drifts_at_rates_of_their_own_show_in_the_longer_records_alone():
+    """Short records show none of a rate; drifts that differ are no hum."""
+    rates = iter((1.1e-6, -0.7e-6, 1.4e-6, -1.2e-6, 0.9e-6, 1e-6, -1e-6))
+    runs = records(lambda t: next(rates) * (t + 0.6 * t**2 / t[-1]), frequencies=(8.0, 13.0, 17.7, 24.2, 196.0, 240.0, 400.0))
+    best = scored(runs)[0]
+    assert best.name == "zero_drift" and best.shapes == {"own": True} and best.z > 20
+
+
 def test_hum_beside_the_drift_does_not_pass_for_it():
     runs = records(lambda t: 2e-7 * np.sin(2 * np.pi * 50.01 * t + 1), frequencies=(10.0, 23.0, 80.0, 120.0))
     best = scored(runs)[0]
