@@ -63,7 +63,7 @@ def excess_of(result, at_noise: float = AT_NOISE) -> float:
 
 # known rivals to first order whose score says little once the base has bent to the other: tried wherever that one is
 COMPANIONS = {"second_eddy_path": "amplifier_lag", "transport_delay": "sensor_lag"}
-FEEDBACKS = ("stress_feedback",)  # its column says little where the base has bent far: tried where all leaders leave a misfit
+FEEDBACKS = ("stress_feedback",)  # its column says little where the base has bent to it: tried wherever it scores
 STRUCTURES = ("eddy_currents",)  # their column at null says little: at their real size they change which relays switch
 
 

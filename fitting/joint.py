@@ -29,6 +29,7 @@ AT_END = (
     1.0,
     5e-4,
 )  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
+PACE = 3, 6  # Jacobians over which the pace towards a target is taken, and after which
 PROMISED = 1e-2  # share of half chi2 that may still be promised there: a kink, or the coarse Jacobian, keeps it
 
 
@@ -238,6 +239,11 @@ def prior_matrix(problem: Problem, weights) -> np.ndarray:
     return matrix
 
 
+def _too_slow(path, left: int, target: float) -> bool:
+    """Whether a chi2 that falls by as much a Jacobian as of late does not come to the target in those that are left."""
+    return len(path) > PACE[1] and path[-1] - left * (path[-1 - PACE[0]] - path[-1]) / PACE[0] > target
+
+
 def solve(
     problem: Problem, z, weights, *, max_jacobians: int = 30, evidence: bool = True, progress=None, target: float = np.inf
 ) -> Solution:
@@ -245,7 +251,7 @@ def solve(
 
     An optimistix solver whose steps are asked for one by one, for the roughness weights move between them.
     `progress(step, chi2 per datum)` is called after each Jacobian; Ctrl-C keeps what was reached. `target`: a chi2 that must
-    be reached to be of use; once four times the promised fall cannot lead there the iteration ends.
+    be reached to be of use; once four times the promised fall cannot lead there, or the pace, the iteration ends.
     """
     layout, count = problem.layout, problem.data_count
     solver = SteppedLevenbergMarquardt(layout.bounds)
@@ -271,7 +277,7 @@ def solve(
             if progress is not None:
                 progress(taken, chi2 / count)
             path.append(chi2)
-            if taken > 3 and chi2 - 8 * state.decrement > target:
+            if taken > 3 and chi2 - 8 * state.decrement > target or _too_slow(path, max_jacobians - taken, target):
                 break
             if chi2 / count > FAR and len(path) > STALLED and chi2 > (1 - STALL) * path[-STALLED]:
                 break

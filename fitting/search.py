@@ -155,7 +155,7 @@ def _trials(task, current, top, candidates, excess) -> list[Trial]:
         # none takes most: a strong effect may act unlike its derivative at null
         known = {t.name for t in trials} | {c.name for c in like}
         like += [c for c in candidates if c.name not in known and abs(c.z) > least and c.visibility > 1e-3]
-    if best and best.result.chi2_per_sample > MISFIT:
+    if best:
         known = {t.name for t in trials} | {c.name for c in like}
         like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]
     for k in range(0, len(like), SIDE_BY_SIDE):

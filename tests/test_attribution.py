@@ -416,6 +416,20 @@ def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, leader
     assert names(fitting.search._trials(task, current, rows[:1], rows, 99.0 * COUNT)) == tried
 
 
+@pytest.mark.parametrize(("z", "tried"), [(9.7, True), (4.0, False)])
+def test_a_feedback_that_scores_is_tried_though_another_meets_the_noise(monkeypatch, z, tried):
+    """Its column at null is what the base has not bent to: a strong one scored two thirds of the quartic law that imitates it."""
+    ends = {"quartic_magnetostriction": 1.03, "stress_feedback": 0.97}
+    rows = [candidate("quartic_magnetostriction", 14.6), candidate("stress_feedback", z, (0, 1, 0))]
+    fitted = lambda task, current, c, excess, target: dataclasses.replace(trial(c.name, ends[c.name], base=1.3), candidate=c)
+    monkeypatch.setattr(fitting.search, "try_effect", fitted)
+    monkeypatch.setattr(fitting.search, "settled", lambda task, current, t, excess, target: t)
+    monkeypatch.setattr(fitting.search, "in_detail", lambda task, base, t, excess: t)
+    current = SimpleNamespace(chi2_per_sample=1.3, data_count=COUNT)
+    found = fitting.search._trials(Task((), None, progress=lambda *a: None), current, leaders(rows), rows, 0.38 * COUNT)
+    assert ("stress_feedback" in names(found)) is tried
+
+
 @pytest.mark.parametrize(("share", "ends", "detailed"), [(0.6, 1.1, True), (0.6, 1.98, False), (0.2, 1.1, False)])
 def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch, share, ends, detailed):
     class Model:

@@ -481,6 +481,15 @@ def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
     assert found.jacobians < 12 if most[0] == 4 else found.jacobians == 30
 
 
+def test_an_iteration_that_is_too_slow_for_its_target_ends():
+    from fitting.joint import _too_slow
+
+    falling = [100.0 - k for k in range(8)]  # by one a Jacobian
+    assert _too_slow(falling, left=10, target=82.0) and not _too_slow(falling, left=10, target=84.0)
+    assert not _too_slow(falling[:5], left=10, target=50.0)  # too early to tell
+    assert not _too_slow(falling, left=10, target=np.inf)
+
+
 def test_a_fast_loop_passes_zero_where_slower_ones_do():
     wide, narrow = (-1.0, 1.0), (-0.6, 0.6)
     assert agreeing([wide, narrow, wide, wide], [True, False, False, True]) == [0, 1, 3]  # the third must turn as the first does
