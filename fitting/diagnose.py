@@ -53,6 +53,8 @@ UNPROMISED = 3.0  # times what any effect promised, that effects take where the 
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
+VERY_ROUGH_CHI2 = 6.0  # chi2/N that a density may leave where the scores tell nothing
+NOTHING_OF_IT = 0.04  # of a misfit, as the square of the highest score: physics outside the catalogue looks more like some of it
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -179,6 +181,7 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
 
 def _concluded(task, evidence) -> Diagnosis:
     """The verdict; where no effect explains the misfit, a rough density's or with a function learned in its place."""
+    evidence = _without_chance(evidence)
     found = verdict(evidence)
     if rough := found.verdict == "unknown_at" and _rough(evidence, found.check):
         found = verdict(evidence, rough=True)
@@ -191,6 +194,21 @@ def _concluded(task, evidence) -> Diagnosis:
         again = verdict(finer, rough=True) if rough and again.verdict != found.verdict else again
         found = again if again.verdict == found.verdict else found
     return found
+
+
+def _without_chance(evidence) -> Evidence:
+    """The evidence without effects that take less than half of a misfit of which the scores tell nothing: by chance, or because
+    the density bends to them, as it does to a mean field."""
+    if not evidence.reached.steps or evidence.share > HALF or not _tells_nothing(evidence):
+        return evidence
+    reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
+    return dataclasses.replace(evidence, reached=reached)
+
+
+def _tells_nothing(evidence) -> bool:
+    """Whether no effect scores beyond what a rough density leaves, or all next to nothing of the misfit."""
+    highest = max((c.z**2 for c in evidence.candidates), default=0.0)
+    return highest < max(SECOND_Z**2, NOTHING_OF_IT * excess_of(evidence.plain))
 
 
 def _on_cells_alone(task, evidence) -> Evidence | None:
@@ -422,11 +440,11 @@ def _rough(evidence, checks) -> bool:
 
     A smooth function could always be learned from it, and would be no physics.
     """
-    if not evidence.excess < ROUGH_CHI2:
-        return False
     steps, current = evidence.reached.steps, evidence.reached.current
     if not steps:
-        return max((abs(c.z) for c in evidence.candidates), default=0.0) < SECOND_Z
+        return evidence.excess < VERY_ROUGH_CHI2 and _tells_nothing(evidence)
+    if not evidence.excess < ROUGH_CHI2:
+        return False
     if too_little(evidence.reached, evidence.plain):
         return True
     choices = current.choices

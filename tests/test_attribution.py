@@ -174,8 +174,8 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
 
 @pytest.mark.parametrize(
     ("chi2n", "z", "rough"),
-    [(1.8, 6.5, True), (1.8, 9.0, False), (4.0, 6.5, False)],
-    ids=["a rough density", "something scores", "too much is left"],
+    [(1.8, 6.5, True), (1.8, 9.0, False), (4.0, 6.5, True), (4.0, 9.0, True), (4.0, 12.0, False), (7.0, 6.5, False)],
+    ids=["a rough density", "something scores", "rougher", "next to nothing of it", "something of it", "too much is left"],
 )
 def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
     from fitting.diagnose import _rough
@@ -183,6 +183,20 @@ def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
     plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
     evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=(candidate("creep", z),), excess=chi2n)
     assert _rough(evidence, ()) == rough
+
+
+@pytest.mark.parametrize(
+    ("z", "ends", "kept"), [(5.8, 2.5, False), (5.8, 1.5, True), (20.0, 2.5, True)], ids=["by chance", "takes most", "scores"]
+)
+def test_what_takes_little_of_a_misfit_that_no_score_tells_of_is_dropped(z, ends, kept):
+    """A null on blocks of random masses: a mean field took a quarter of chi2/N = 2.9 at z = -5.8, and ended as `unknown_at`."""
+    from fitting.diagnose import _without_chance
+
+    plain, current = (SimpleNamespace(chi2_per_sample=c, data_count=COUNT) for c in (2.9, ends))
+    reached = Reached(current, [(trial("mean_field", ends), [], [], plain)], {})
+    evidence = Evidence(reached, (), plain, plain, (candidate("mean_field", z),), (), None, ((), ()), {}, {}, ())
+    found = _without_chance(evidence)
+    assert bool(found.reached.steps) is kept and (found.reached.current is current) is kept
 
 
 @pytest.mark.parametrize(
