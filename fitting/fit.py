@@ -83,7 +83,8 @@ def fit(
         highest = REFINE_MATERIAL if bench.drive != "current" else REFINE_BESIDE if actuator.effects else REFINE_BELOW
         highest = highest if refine is True else refine
         problem, solution, choices = _refine_density(problem, solution, actuator, bench, names, choices, spectra, report, highest)
-    return dataclasses.replace(finish(problem, solution, choices, bench, recordings, warm), history=tuple(history))
+    ended = finish(problem, solution, choices, bench, recordings, warm, target)
+    return dataclasses.replace(ended, history=tuple(history))
 
 
 def fit_or_stop(*arguments, **options) -> FitResult:
@@ -243,12 +244,12 @@ def _resample(problem, solution, spectra, actuator, bench, names, choices):
 _actuator_at = eqx.filter_jit(lambda layout, template, z: layout.actuator(template, z))  # one program, not one an operation
 
 
-def finish(problem, solution, choices, bench, recordings, warm=0.0) -> FitResult:
-    """Estimates (quoted with a tenth of the roughness weights), per-recording misfit, outcome."""
+def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.inf) -> FitResult:
+    """Estimates (quoted with a tenth of the roughness weights, but of a fit that missed its `target`), per-recording misfit, outcome."""
     fitted = _actuator_at(problem.layout, problem.template, jnp.asarray(solution.z))
     count = problem.data_count
     refined = solution
-    if solution.chi2 / count < 20:
+    if solution.chi2 / count < 20 and not solution.chi2 > target:
         refined = solve(problem, solution.z, UNDERSMOOTH * solution.weights, max_jacobians=4, evidence=False)
     quoted = _actuator_at(problem.layout, problem.template, jnp.asarray(refined.z))
     rows = estimates(problem, refined, quoted)

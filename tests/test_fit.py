@@ -152,6 +152,14 @@ def test_the_papers_recipe_beside_a_fit(recordings, result):
     assert "R_eddy" in str(table)
 
 
+def test_a_fit_that_misses_its_target_is_not_quoted_anew(recordings, bench, result):
+    """A trial of no use costs no further Jacobians; one that comes near is quoted with a tenth of the weights as ever."""
+    same = {"choices": result.choices, "refine": False, "start": result, "spectra": result.spectra}
+    missed, met = (fit(recordings, bench, actuator=result.actuator, target=t, **same) for t in (1.0, 1e9))
+    assert missed.refined is missed.solution and met.refined is not met.solution
+    assert np.allclose(met.refined.weights, 0.1 * met.solution.weights)
+
+
 def test_a_given_history_is_where_every_recording_starts(recordings, bench):
     past = dataclasses.replace(bench, start=(20000.0, 5000.0, 15000.0))
     found = fit(recordings, past, choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
