@@ -189,11 +189,12 @@ def credited(candidate, result, base, effect, excess) -> Trial:
 
 
 def _physical(effect, result) -> bool:
-    """Whether an effect's amplitude has a sign and a size that it can have; one that ends in a bound of its own may run on."""
+    """Whether an effect's amplitude has a sign and a size that it can have, and it is what it is named for; an amplitude that
+    ends in a bound of its own may run on."""
     info = effect.parameters()[effect.amplitude]
     amplitude = result.estimate(f"effects.{effect.name}.{effect.amplitude}").value
     largest = OUT_OF_REACH * max(map(abs, info.typical)) if info.typical and np.isinf(info.high) else np.inf
-    return abs(amplitude) <= largest and (amplitude >= 0 or info.low < 0)
+    return abs(amplitude) <= largest and (amplitude >= 0 or info.low < 0) and effect.is_itself()
 
 
 def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:

@@ -232,6 +232,15 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
     assert _physical(effect, result) == physical
 
 
+@pytest.mark.parametrize(("damping", "physical"), [(0.1, True), (0.9, True), (1.6, False)])
+def test_a_second_mode_without_a_swing_is_none(damping, physical):
+    """Two real lags imitated a structural damping beside a crosstalk better than either alone."""
+    from fitting.attribute import _physical
+
+    effect = CLASSES["second_mode"](gain=0.01, f2=66.0, xi2=damping)
+    assert _physical(effect, SimpleNamespace(estimate=lambda name: SimpleNamespace(value=0.01))) is physical
+
+
 @pytest.mark.parametrize(
     ("chi2n", "before", "after", "word"),
     [

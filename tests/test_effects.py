@@ -344,16 +344,19 @@ def test_slow_states_are_led_to_their_repeat(effect):
     assert np.abs(few - many).max() < 0.03 * np.abs(many - before).max()
 
 
-@pytest.mark.parametrize(("of_field", "shortest", "exponent"), [(0.0, 1e-5, 0.0), (0.0, 2e-3, 0.3), (1.0, 3e-4, -0.3)])
-def test_the_aftereffect_weighs_its_lags_by_a_power_of_time(of_field, shortest, exponent):
+@pytest.mark.parametrize(
+    ("of_field", "shortest", "exponent", "longest"),
+    [(0.0, 1e-5, 0.0, 100.0), (0.0, 2e-3, 0.3, 3.0), (1.0, 3e-4, -0.3, 3.0), (0.0, 4e-4, -0.3, 8e-3)],
+)
+def test_the_aftereffect_weighs_its_lags_by_a_power_of_time_between_two_ends(of_field, shortest, exponent, longest):
     """What is late, against the ladder's response at each harmonic of the relays' magnetization or field."""
     act, dt, share = actuator(20), DT / 4, 0.1
     turn = jnp.arange(4 * N) / (4 * N)
     fine = CURRENT.mean() + 0.4 * jnp.ptp(CURRENT) * jnp.sin(2 * jnp.pi * turn)
-    effect = effects.MagneticAftereffect(share=share, of_field=of_field, shortest=shortest, exponent=exponent)
+    effect = effects.MagneticAftereffect(share=share, of_field=of_field, shortest=shortest, exponent=exponent, longest=longest)
     found = run_chain(act.with_effect(effect), fine, dt, 5, 4)
     times = 10.0 ** np.arange(-4, 0.1, 0.5)
-    weights = times**exponent / (1 + (shortest / times) ** 2)
+    weights = times**exponent / (1 + (shortest / times) ** 2) / (1 + (times / longest) ** 2)
     s = 2j * np.pi * np.arange(len(fine) // 2 + 1)[:, None] / (len(fine) * dt)
     gain = 1 + share * ((weights / (1 + s * times)).sum(1) / weights.sum() - 1)
     H, M = np.asarray(found.field), np.asarray(found.magnetization)

@@ -91,6 +91,10 @@ class AbstractEffect(eqx.Module):
             return None
         return dataclasses.replace(self, **{n: info.scale for n, info in kept.items() if info.default == 0})
 
+    def is_itself(self) -> bool:
+        """Whether its parameters are those of what it is named for: elsewhere its law may imitate what it is not."""
+        return True
+
     @classmethod
     def elsewhere(cls) -> tuple:
         """Where else a fit may begin, far from the null, for laws whose first order misleads: effects with all their parameters."""

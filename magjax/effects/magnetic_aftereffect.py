@@ -16,7 +16,7 @@ class MagneticAftereffect(AbstractEffect):
     """A share of the magnetization arrives late, through a ladder of lags, equal a decade; or, `of_field`, of the field.
 
     Lags that are much longer than a period show as a smaller share alone, and those much shorter than the fastest change
-    not at all: `shortest` and `exponent` say how the lags between are spread.
+    not at all: `shortest`, `exponent` and `longest` say how the lags between are spread.
     """
 
     share: Float[Array, ""] = param(
@@ -36,12 +36,15 @@ class MagneticAftereffect(AbstractEffect):
         3e-4, "s", "lag below which there is less and less", low=1e-6, scale=3e-4, shape=True, detail=True, typical=(1e-5, 1e-1)
     )
     exponent: Float[Array, ""] = power_of_time((-0.3, 0.3))
+    longest: Float[Array, ""] = param(
+        3.0, "s", "lag above which there is less and less", low=1e-4, scale=3.0, shape=True, detail=True, typical=(1e-2, 1e2)
+    )
 
     name = "magnetic_aftereffect"
     block = "hysteresis"
     law = (
         "M -> M + S (mean of lags of M - M), or v -> v + S (mean of lags of v - v); lags 0.1 ms .. 1 s, two a decade, "
-        "weighing tau^exponent / (1 + (shortest / tau)^2)"
+        "weighing tau^exponent / ((1 + (shortest / tau)^2) (1 + (tau / longest)^2))"
     )
     source = (
         "R. Street, J. C. Woolley, Proc. Phys. Soc. A 62 (1949) 562: M(t) ~ S log t by a spread of times; "
@@ -60,7 +63,8 @@ class MagneticAftereffect(AbstractEffect):
         return (lags, lags, zero, zero, trial.field, trial.magnetization)
 
     def _weighted(self, lags):
-        weights = (TIMES / TIMES[-1]) ** self.exponent / (1 + (self.shortest / TIMES) ** 2)
+        spread = (1 + (self.shortest / TIMES) ** 2) * (1 + (TIMES / self.longest) ** 2)
+        weights = (TIMES / TIMES[-1]) ** self.exponent / spread
         return jnp.tensordot(weights / jnp.sum(weights), lags, 1)
 
     def _late(self, trial, lags, before, now):

@@ -29,6 +29,10 @@ class SecondMode(AbstractEffect):
     signature = "linear in the forcing: a resonance in the harmonics near f2, whichever drive makes them"
     amplitude = "gain"
 
+    def is_itself(self) -> bool:
+        """Not where it is overdamped: two lags and no mode, which imitate whatever relaxes."""
+        return bool(self.xi2 < 1)
+
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with the second mode, m."""
         w2 = 2 * jnp.pi * self.f2
