@@ -232,12 +232,20 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
     assert _physical(effect, result) == physical
 
 
-@pytest.mark.parametrize(("damping", "physical"), [(0.1, True), (0.9, True), (1.6, False)])
-def test_a_second_mode_without_a_swing_is_none(damping, physical):
-    """Two real lags imitated a structural damping beside a crosstalk better than either alone."""
+@pytest.mark.parametrize(
+    ("effect", "physical"),
+    [
+        (CLASSES["second_mode"](gain=0.01, f2=66.0, xi2=0.9), True),
+        (CLASSES["second_mode"](gain=0.01, f2=66.0, xi2=1.6), False),
+        (CLASSES["duffing_stiffness"](k3=0.3, k5=4.0), True),
+        (CLASSES["duffing_stiffness"](k3=0.3, k5=38.0), False),
+    ],
+    ids=["a mode", "two lags", "a spring", "a stop"],
+)
+def test_a_law_bent_into_another_is_not_named(effect, physical):
+    """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop."""
     from fitting.attribute import _physical
 
-    effect = CLASSES["second_mode"](gain=0.01, f2=66.0, xi2=damping)
     assert _physical(effect, SimpleNamespace(estimate=lambda name: SimpleNamespace(value=0.01))) is physical
 
 

@@ -6,6 +6,8 @@ from ..param import param
 from .base import AbstractEffect
 from .forces import with_force
 
+STOP = 10.0  # of k5: the stiffness added at half the reach is then mostly that of the fifth power
+
 
 class DuffingStiffness(AbstractEffect):
     """Spring that stiffens with the displacement: relative stiffness k3 r^2 (1 + k5 r^2), r = y / saturation displacement.
@@ -40,6 +42,10 @@ class DuffingStiffness(AbstractEffect):
     def elsewhere(cls):
         """A spring that is at rest within the stroke: about its null its stiffening looks like a softening."""
         return (cls(k3=0.6, rest=0.35),)
+
+    def is_itself(self) -> bool:
+        """Not where it grows so fast that it is a stop."""
+        return bool(abs(self.k5) < STOP)
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with the cubic spring, m."""
