@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 from scipy.optimize import minimize
 
-from .spectra import fit_lines, pooled_noise
+from .spectra import estimate_noise, fit_lines
 
 SEEN = 40.0  # fall of chi2 by two columns from which a start counts as unsettled
 SHARE = 0.5  # of what exceeds the noise between the harmonics; less is another cause
@@ -69,7 +69,10 @@ def _white(s):
 
 
 def _later_noise(spectra):
-    """The law of the noise in the later halves of the records, a function from a spectrum, or None where none holds two periods."""
+    """The noise of the later halves of the records, or None where none holds two periods.
+
+    By frequency: a decay that goes by periods and not by time, which is no free motion, would pass for noise by the rate.
+    """
     halves = []
     for s in spectra:
         if s.periods < 4:
@@ -82,7 +85,7 @@ def _later_noise(spectra):
         keep = (f > 0) & (np.abs(order - np.round(order)) > 0.3)
         power = np.abs(np.fft.rfft(residue)) ** 2 / len(residue)
         halves.append(dataclasses.replace(s, between_f=f[keep], between_power=power[keep], residue=residue))
-    return pooled_noise(halves) if halves else None
+    return estimate_noise(halves) if halves else None
 
 
 def unsettled_starts(spectra, f0: float, xi: float) -> list:
@@ -100,7 +103,7 @@ def unsettled_starts(spectra, f0: float, xi: float) -> list:
         return nothing
     later = _later_noise([spectra[k] for k in usable])
     if later is not None:
-        gaps = [_Gaps.of(spectra[k], later(spectra[k]).density) for k in usable]
+        gaps = [_Gaps.of(spectra[k], later.density) for k in usable]
         scores = [falls(p) for p in trials]
 
     def missed(logs):
