@@ -20,15 +20,11 @@ from .locate import where
 from .on_lines import hum_score, offset_score, zeros_score
 from .reach import BEYOND
 from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect, zeros_of
-from .search import SECOND_Z, screened, search
+from .rough import by_cells, is_rough, on_cells_alone, without_chance
+from .search import screened, search
 from .setup import Choices, spectra_of, with_held_masses
-from .task import Task, freed_beyond
-from .together import together
+from .task import Task
 from .verdict import (
-    FULL_SHARE,
-    HALF,
-    NULL_CHI2,
-    ROUGH_CHI2,
     SILENT_CHI2,
     WORSE,
     Z_THRESHOLD,
@@ -36,7 +32,6 @@ from .verdict import (
     Evidence,
     least_excess,
     misfit,
-    too_little,
     verdict,
 )
 
@@ -46,15 +41,10 @@ MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros o
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
 ABSORBED_VISIBILITY = 0.004
 LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
-FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
-CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
-CELLS_ALONE, CELLS_LEAVE = 0.9, 1.45  # the same where they are to explain a misfit alone, and the chi2/N that they must come below
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
-VERY_ROUGH_CHI2 = 6.0  # chi2/N that a density may leave where the scores tell nothing
-NOTHING_OF_IT = 0.04  # of a misfit, as the square of the highest score: physics outside the catalogue looks more like some of it
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -181,91 +171,19 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
 
 def _concluded(task, evidence) -> Diagnosis:
     """The verdict; where no effect explains the misfit, a rough density's or with a function learned in its place."""
-    evidence = _without_chance(evidence)
+    evidence = without_chance(evidence)
     found = verdict(evidence)
-    if rough := found.verdict == "unknown_at" and _rough(evidence, found.check):
+    if rough := found.verdict == "unknown_at" and is_rough(evidence, found.check):
         found = verdict(evidence, rough=True)
-    elif found.verdict in ("unknown_at", "attributed", "group") and (rougher := _on_cells_alone(task, evidence)):
+    elif found.verdict in ("unknown_at", "attributed", "group") and (rougher := on_cells_alone(task, evidence)):
         return verdict(rougher, rough=True)
     if found.verdict == "unknown_at":
         return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], task.progress)
-    if (rough or found.repaired is not None) and (finer := _by_cells(task, evidence)):
+    if (rough or found.repaired is not None) and (finer := by_cells(task, evidence)):
         again = verdict(finer)
         again = verdict(finer, rough=True) if rough and again.verdict != found.verdict else again
         found = again if again.verdict == found.verdict else found
     return found
-
-
-def _without_chance(evidence) -> Evidence:
-    """The evidence without effects that take less than half of a misfit of which the scores tell nothing: by chance, or because
-    the density bends to them, as it does to a mean field."""
-    if not evidence.reached.steps or evidence.share > HALF or not _tells_nothing(evidence):
-        return evidence
-    reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
-    return dataclasses.replace(evidence, reached=reached)
-
-
-def _tells_nothing(evidence) -> bool:
-    """Whether no effect scores beyond what a rough density leaves, or all next to nothing of the misfit."""
-    highest = max((c.z**2 for c in evidence.candidates), default=0.0)
-    return highest < max(SECOND_Z**2, NOTHING_OF_IT * excess_of(evidence.plain))
-
-
-def _on_cells_alone(task, evidence) -> Evidence | None:
-    """The same with nothing but masses of cells, where they alone come near the noise, foretell what was left out better than
-    hats, and leave an effect that was found less than half of the rest to take. None elsewhere.
-
-    A density of rough cells leaves chi2/N of 1.5 to 3 on hats, and a law that bends the loops takes some of it by chance.
-    Cells take up physics as well, but leave more of it: that it comes near the noise on them is what tells.
-    """
-    current, plain = evidence.reached.current, evidence.plain
-    near = SETTLED_CHI2 < current.chi2_per_sample < ROUGH_CHI2 and plain.chi2_per_sample < REFINE_BELOW
-    if task.bench.drive != "current" or evidence.adopted or plain.choices.knots is None or not near:
-        return None
-    cells = min(_fits_on_cells(task, plain), key=_cross_validation, default=plain)
-    if not (cells.chi2_per_sample < CELLS_LEAVE and _cross_validation(cells) < CELLS_ALONE * _cross_validation(plain)):
-        return None
-    if evidence.reached.steps:
-        beside = task.fit_on(cells, current.actuator, choices=cells.choices, extra=freed_beyond(current))
-        if chi2_of(cells) - chi2_of(beside) > max(MIN_DROP, HALF * excess_of(cells, NULL_CHI2)):
-            return None
-    reached = dataclasses.replace(evidence.reached, current=cells, steps=[], form=None)
-    return dataclasses.replace(evidence, reached=reached, raw=cells, plain=cells)
-
-
-def _fits_on_cells(task, result) -> list:
-    """Fits of the same on densities of cells."""
-    same = {"extra": freed_beyond(result), "spectra": result.spectra, "refine": False}
-
-    def on(choices):
-        return lambda say: task.on(progress=say).fit(result.actuator, choices=choices, **same)
-
-    return together([on(choices) for choices in finer_than(result.choices, task.bench)[1]], task.progress)
-
-
-def _by_cells(task, evidence) -> Evidence | None:
-    """The same with masses of cells in the final model, where they promise to foretell better; None elsewhere.
-
-    After the verdict, for they take up physics too, which hats leave for an effect to explain. By generalized
-    cross-validation: on densities that hats follow, cells lower chi2 and foretell far worse.
-    """
-    current, plain = evidence.reached.current, evidence.plain
-    if (
-        task.bench.drive != "current"
-        or not current.chi2_per_sample > FINER_FROM[1]
-        or (current is plain and evidence.raw is not plain)
-    ):
-        return None
-    best = min(_fits_on_cells(task, current), key=_cross_validation, default=current)
-    if not _cross_validation(best) < CELLS_BETTER * _cross_validation(current):
-        return None
-    finer = dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, current=best))
-    return dataclasses.replace(finer, raw=best, plain=best) if current is plain else finer
-
-
-def _cross_validation(result) -> float:
-    """Generalized cross-validation of a fit, up to a factor (Golub, Heath and Wahba, Technometrics 21, 1979)."""
-    return chi2_of(result) / (result.data_count - result.unknowns) ** 2
 
 
 def _with_zero(found, zero, rival) -> Diagnosis:
@@ -431,26 +349,3 @@ def _floors(result) -> dict:
         "solver_rms": solver_floor(result.problem, result.solution),
         "density_rms": float(noise * np.sqrt(above)),
     }
-
-
-def _rough(evidence, checks) -> bool:
-    """Whether what is left is the density's: little, and nothing scores beyond what a rough one leaves and nothing earned its
-    place; or a finer density was asked for and what is named foretells the check recordings, which took no part
-    (without any, it must explain all but a little).
-
-    A smooth function could always be learned from it, and would be no physics.
-    """
-    steps, current = evidence.reached.steps, evidence.reached.current
-    if not steps:
-        return evidence.excess < VERY_ROUGH_CHI2 and _tells_nothing(evidence)
-    if not evidence.excess < ROUGH_CHI2:
-        return False
-    if too_little(evidence.reached, evidence.plain):
-        return True
-    choices = current.choices
-    finer = choices.knots[0] > Choices().knots[0] if choices.knots is not None else choices.rest != "held"
-    if not checks:
-        return finer and evidence.share > FULL_SHARE
-    before, after = ([misfit([row], which) for row in checks] for which in ("rms_before", "rms_after"))
-    left = [a / b for a, b in zip(after, before, strict=True) if b > 1]  # of those that leave something to foretell
-    return finer and sum(before) > len(checks) and sum(after) < FORETOLD * sum(before) and bool(np.median(left) < FORETOLD)

@@ -178,11 +178,11 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     ids=["a rough density", "something scores", "rougher", "next to nothing of it", "something of it", "too much is left"],
 )
 def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
-    from fitting.diagnose import _rough
+    from fitting.rough import is_rough
 
     plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
     evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=(candidate("creep", z),), excess=chi2n)
-    assert _rough(evidence, ()) == rough
+    assert is_rough(evidence, ()) == rough
 
 
 @pytest.mark.parametrize(
@@ -190,12 +190,12 @@ def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
 )
 def test_what_takes_little_of_a_misfit_that_no_score_tells_of_is_dropped(z, ends, kept):
     """A null on blocks of random masses: a mean field took a quarter of chi2/N = 2.9 at z = -5.8, and ended as `unknown_at`."""
-    from fitting.diagnose import _without_chance
+    from fitting.rough import without_chance
 
     plain, current = (SimpleNamespace(chi2_per_sample=c, data_count=COUNT) for c in (2.9, ends))
     reached = Reached(current, [(trial("mean_field", ends), [], [], plain)], {})
     evidence = Evidence(reached, (), plain, plain, (candidate("mean_field", z),), (), None, ((), ()), {}, {}, ())
-    found = _without_chance(evidence)
+    found = without_chance(evidence)
     assert bool(found.reached.steps) is kept and (found.reached.current is current) is kept
 
 
@@ -204,7 +204,7 @@ def test_what_takes_little_of_a_misfit_that_no_score_tells_of_is_dropped(z, ends
     ids=["a rough density", "checks not foretold", "one alone foretold", "a smooth density"],
 )  # fmt: skip
 def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(knots, after, rough):
-    from fitting.diagnose import _rough
+    from fitting.rough import is_rough
 
     plain = SimpleNamespace(chi2_per_sample=1.8, data_count=COUNT)
     current = SimpleNamespace(chi2_per_sample=1.4, data_count=COUNT, choices=Choices(knots=knots))
@@ -216,7 +216,7 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
     )
     large = (2e-6, 4e-7, 4e-7)[: len(after)] if len(after) > 1 else (2e-7,)
     rows = [{"rms_before": b, "rms_after": a, "noise_rms": 5e-8} for b, a in zip(large, after, strict=True)]
-    assert _rough(evidence, rows) == rough
+    assert is_rough(evidence, rows) == rough
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fitting.diagnose as module
+import fitting.rough as rough_module
 import fitting.search as search_module
 from fitting.attribute import Trial, chi2_of
 from fitting.check import check_errors
@@ -151,7 +152,7 @@ def test_masses_of_cells_serve_a_final_model_where_they_promise_to_foretell_bett
         Task, "fit", lambda task, actuator, choices, extra, **more: levels.append((choices.level, extra)) or fits[choices.level]
     )
     evidence = evidence_of([], now, now, (), {})
-    found = module._by_cells(Task((), bench), evidence)
+    found = rough_module.by_cells(Task((), bench), evidence)
     assert sorted(levels) == [(level, ("sensor.offset",)) for level in sorted(fits)] and (found and found.excess) == taken
 
 
@@ -186,7 +187,7 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
     steps = [trial("mean_field", current, 200.0)] if beside else []
     reached = Reached(current, steps, {})
     evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), reached=reached)
-    found = module._on_cells_alone(Task((), bench), evidence)
+    found = rough_module.on_cells_alone(Task((), bench), evidence)
     assert (found is not None) == rough
     assert not rough or (found.raw is found.plain is found.reached.current is fits[32] and not found.reached.steps)
 

@@ -1,0 +1,114 @@
+"""What a misfit owes to the density: told from physics by what the scores tell, by the check recordings, and by masses of cells."""
+
+import dataclasses
+
+import numpy as np
+
+from .attribute import MIN_DROP, SETTLED_CHI2, chi2_of, excess_of
+from .fit import FINER_FROM, REFINE_BELOW, finer_than
+from .search import SECOND_Z
+from .setup import Choices
+from .task import freed_beyond
+from .together import together
+from .verdict import FULL_SHARE, HALF, NULL_CHI2, ROUGH_CHI2, Evidence, misfit, too_little
+
+FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
+CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
+CELLS_ALONE, CELLS_LEAVE = 0.9, 1.45  # the same where they are to explain a misfit alone, and the chi2/N that they must come below
+VERY_ROUGH_CHI2 = 6.0  # chi2/N that a density may leave where the scores tell nothing
+NOTHING_OF_IT = 0.04  # of a misfit, as the square of the highest score: physics outside the catalogue looks more like some of it
+
+
+def without_chance(evidence) -> Evidence:
+    """The evidence without effects that take less than half of a misfit of which the scores tell nothing: by chance, or because
+    the density bends to them, as it does to a mean field."""
+    if not evidence.reached.steps or evidence.share > HALF or not _tells_nothing(evidence):
+        return evidence
+    reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
+    return dataclasses.replace(evidence, reached=reached)
+
+
+def _tells_nothing(evidence) -> bool:
+    """Whether no effect scores beyond what a rough density leaves, or all next to nothing of the misfit."""
+    highest = max((c.z**2 for c in evidence.candidates), default=0.0)
+    return highest < max(SECOND_Z**2, NOTHING_OF_IT * excess_of(evidence.plain))
+
+
+def is_rough(evidence, checks) -> bool:
+    """Whether what is left is the density's: little, and nothing scores beyond what a rough one leaves and nothing earned its
+    place; or a finer density was asked for and what is named foretells the check recordings, which took no part
+    (without any, it must explain all but a little).
+
+    A smooth function could always be learned from it, and would be no physics.
+    """
+    steps, current = evidence.reached.steps, evidence.reached.current
+    if not steps:
+        return evidence.excess < VERY_ROUGH_CHI2 and _tells_nothing(evidence)
+    if not evidence.excess < ROUGH_CHI2:
+        return False
+    if too_little(evidence.reached, evidence.plain):
+        return True
+    choices = current.choices
+    finer = choices.knots[0] > Choices().knots[0] if choices.knots is not None else choices.rest != "held"
+    if not checks:
+        return finer and evidence.share > FULL_SHARE
+    before, after = ([misfit([row], which) for row in checks] for which in ("rms_before", "rms_after"))
+    left = [a / b for a, b in zip(after, before, strict=True) if b > 1]  # of those that leave something to foretell
+    return finer and sum(before) > len(checks) and sum(after) < FORETOLD * sum(before) and bool(np.median(left) < FORETOLD)
+
+
+def on_cells_alone(task, evidence) -> Evidence | None:
+    """The same with nothing but masses of cells, where they alone come near the noise, foretell what was left out better than
+    hats, and leave an effect that was found less than half of the rest to take. None elsewhere.
+
+    A density of rough cells leaves chi2/N of 1.5 to 3 on hats, and a law that bends the loops takes some of it by chance.
+    Cells take up physics as well, but leave more of it: that it comes near the noise on them is what tells.
+    """
+    current, plain = evidence.reached.current, evidence.plain
+    near = SETTLED_CHI2 < current.chi2_per_sample < ROUGH_CHI2 and plain.chi2_per_sample < REFINE_BELOW
+    if task.bench.drive != "current" or evidence.adopted or plain.choices.knots is None or not near:
+        return None
+    cells = min(_fits_on_cells(task, plain), key=_cross_validation, default=plain)
+    if not (cells.chi2_per_sample < CELLS_LEAVE and _cross_validation(cells) < CELLS_ALONE * _cross_validation(plain)):
+        return None
+    if evidence.reached.steps:
+        beside = task.fit_on(cells, current.actuator, choices=cells.choices, extra=freed_beyond(current))
+        if chi2_of(cells) - chi2_of(beside) > max(MIN_DROP, HALF * excess_of(cells, NULL_CHI2)):
+            return None
+    reached = dataclasses.replace(evidence.reached, current=cells, steps=[], form=None)
+    return dataclasses.replace(evidence, reached=reached, raw=cells, plain=cells)
+
+
+def by_cells(task, evidence) -> Evidence | None:
+    """The same with masses of cells in the final model, where they promise to foretell better; None elsewhere.
+
+    After the verdict, for they take up physics too, which hats leave for an effect to explain. By generalized
+    cross-validation: on densities that hats follow, cells lower chi2 and foretell far worse.
+    """
+    current, plain = evidence.reached.current, evidence.plain
+    if (
+        task.bench.drive != "current"
+        or not current.chi2_per_sample > FINER_FROM[1]
+        or (current is plain and evidence.raw is not plain)
+    ):
+        return None
+    best = min(_fits_on_cells(task, current), key=_cross_validation, default=current)
+    if not _cross_validation(best) < CELLS_BETTER * _cross_validation(current):
+        return None
+    finer = dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, current=best))
+    return dataclasses.replace(finer, raw=best, plain=best) if current is plain else finer
+
+
+def _fits_on_cells(task, result) -> list:
+    """Fits of the same on densities of cells."""
+    same = {"extra": freed_beyond(result), "spectra": result.spectra, "refine": False}
+
+    def on(choices):
+        return lambda say: task.on(progress=say).fit(result.actuator, choices=choices, **same)
+
+    return together([on(choices) for choices in finer_than(result.choices, task.bench)[1]], task.progress)
+
+
+def _cross_validation(result) -> float:
+    """Generalized cross-validation of a fit, up to a factor (Golub, Heath and Wahba, Technometrics 21, 1979)."""
+    return chi2_of(result) / (result.data_count - result.unknowns) ** 2
