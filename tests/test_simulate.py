@@ -88,8 +88,22 @@ def test_gradient_in_every_parameter():
         assert reverse == pytest.approx(forward, rel=1e-9), name
 
 
-@pytest.mark.parametrize("scheme", ["trapezoid", "bdf2"])
-@pytest.mark.parametrize("effects", [(), (ExcessLoss(k=20.0), StressFeedback(stiffness=2e7)), (MagneticAftereffect(share=0.2),)])
+BESIDE = {
+    "alone": (),
+    "loss and stress": (ExcessLoss(k=20.0), StressFeedback(stiffness=2e7)),
+    "after-effect": (MagneticAftereffect(share=0.2),),
+}
+SAMPLE = {("trapezoid", "alone"), ("bdf2", "loss and stress"), ("trapezoid", "after-effect")}
+
+
+@pytest.mark.parametrize(
+    "scheme, effects",
+    [
+        pytest.param(scheme, effects, id=f"{scheme}, {name}", marks=[] if (scheme, name) in SAMPLE else pytest.mark.long)
+        for scheme in ("trapezoid", "bdf2")
+        for name, effects in BESIDE.items()
+    ],
+)
 def test_the_replay_has_the_derivatives_of_the_march(scheme, effects):
     """In every number that goes in, with nested loops after a history, effects inside the step and a disturbance."""
     act = actuator(12)
