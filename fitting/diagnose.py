@@ -20,7 +20,7 @@ from .locate import where
 from .on_lines import hum_score, offset_score, zeros_score
 from .reach import BEYOND
 from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect, zeros_of
-from .rough import by_cells, is_rough, on_cells_alone, without_chance
+from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance
 from .search import screened, search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
@@ -176,6 +176,8 @@ def _concluded(task, evidence) -> Diagnosis:
     if rough := found.verdict == "unknown_at" and is_rough(evidence, found.check):
         found = verdict(evidence, rough=True)
     elif found.verdict in ("unknown_at", "attributed", "group") and (rougher := on_cells_alone(task, evidence)):
+        return verdict(rougher, rough=True)
+    if found.verdict == "unknown_at" and not rough and (rougher := beside_cells(task, evidence)):
         return verdict(rougher, rough=True)
     if found.verdict == "unknown_at":
         return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], task.progress)
