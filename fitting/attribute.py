@@ -62,7 +62,8 @@ def excess_of(result, at_noise: float = AT_NOISE) -> float:
 
 
 # known rivals to first order whose score says little once the base has bent to the other: tried wherever that one is
-COMPANIONS = {"second_eddy_path": "amplifier_lag", "transport_delay": "sensor_lag"}
+LAGS = ("amplifier_lag", "sensor_lag", "transport_delay")
+COMPANIONS = dict.fromkeys(("second_eddy_path", *LAGS), LAGS)
 FEEDBACKS = ("stress_feedback",)  # its column says little where the base has bent to it: tried wherever it scores
 STRUCTURES = ("eddy_currents",)  # their column at null says little: at their real size they change which relays switch
 
@@ -87,7 +88,7 @@ def family(best: Candidate, candidates, tried) -> list[Candidate]:
     """Candidates not `tried` (names) that look like the best to first order, or score nearly as it does."""
     near = [c for c in candidates if c.name not in tried and abs(c.z) > 3 and c.visibility > 1e-3]
     like = [c for c in near if _alike(c, best) > FAMILY or abs(c.z) > CLOSE * abs(best.z)][:MATES]
-    known = [c for c in candidates if c.name == COMPANIONS.get(best.name) and c.name not in tried and c not in like]
+    known = [c for c in candidates if c.name in COMPANIONS.get(best.name, ()) and c.name not in tried and c not in like]
     return known + like
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from magjax.bench import load_bench
 
 from .alternation import alternating
-from .attribute import MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
+from .attribute import BIC_DROP, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
 from .fit import FINER_FROM, REFINE_BELOW, finer_than
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
@@ -38,6 +38,7 @@ from .verdict import (
 RECORD_Z = 8.0
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
+MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the recordings must hold
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
 ABSORBED_VISIBILITY = 0.004
 LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
@@ -147,7 +148,7 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
     plain, candidates = _screened_finer(task, plain, candidates, free)
     raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
     place = where(plain, candidates, task.recordings, task.bench.output)
-    anew = []  # what the diagnosis begins anew with: recordings without a hum that showed beside an effect, or a better plain fit
+    anew = []  # what the diagnosis begins anew with: recordings without what showed beside an effect, or a better plain fit
 
     def begins_anew(current) -> bool:
         if found := _hum_on_harmonics(task, adopted, current):
@@ -157,7 +158,13 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
             anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
         return bool(anew)
 
-    reached = search(task, plain, candidates, checks[1], begins_anew)
+    def free_means(fit, best) -> bool:
+        if zeros and zero is None and (found := _unsettled_means(task, adopted, fit, best)):
+            cleaned, own = found
+            anew.append({"task": cleaned, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
+        return bool(anew)
+
+    reached = search(task, plain, candidates, checks[1], begins_anew, free_means)
     if anew:
         return _examined(measured=measured, check=check, zeros=zeros, **anew[-1])
     if before_zeros and _needless_zeros(before_zeros[0], reached):
@@ -263,6 +270,29 @@ def _own_zeros(task, adopted, base, candidates):
     if any(t.physical and chi2_of(t.result) + t.parameters * np.log(freed.data_count) < cost for t in trials):
         return None
     return cleaned, (effect, rivals), freed
+
+
+def _unsettled_means(task, adopted, slow, best):
+    """Means that an effect has brought as far in each recording as the drive had run before: set free where they hold most of
+    what the fit with this `slow` effect leaves, and so serve better than the `best` of all. Returns the task with free means
+    and the effect with its rivals; None elsewhere.
+
+    Its law has one such number for all recordings; with the others wrong, another slow effect that bends the means serves better.
+    """
+    held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
+    if held or bench.output != "displacement" or _quasistatic(bench) or not best.chi2_per_sample > MISFIT:
+        return None
+    excess = excess_of(slow)
+    z, zeros, errors = zeros_score(slow.problem, slow.refined)
+    cost = len(zeros) * np.log(best.data_count) + BIC_DROP
+    if z**2 < MEANS_HOLD * excess or chi2_of(slow) - z**2 + cost > chi2_of(best):
+        return None
+    task.say("with means of their own", slow.chi2_per_sample)
+    effect, *rivals = zeros_of(slow.spectra, z, zeros, errors, [e.name for e, _ in adopted])
+    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
+    freed = cleaned.fit(slow.actuator, start=slow, choices=slow.choices, refine=False)
+    met = chi2_of(freed) < min(chi2_of(slow) - MEANS_HOLD * excess, chi2_of(best) - cost)
+    return (cleaned, (effect, rivals)) if met else None
 
 
 def _needless_zeros(task, reached) -> bool:

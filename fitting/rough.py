@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from .attribute import MIN_DROP, SETTLED_CHI2, chi2_of, credited, excess_of, rivals_of
+from .attribute import MIN_DROP, SETTLED_CHI2, chi2_of, excess_of
 from .fit import FINER_FROM, REFINE_BELOW, finer_than
-from .search import SECOND_Z, screened
+from .search import SECOND_Z, screened, search
 from .setup import Choices
 from .task import freed_beyond
 from .together import together
@@ -16,7 +16,6 @@ FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of th
 CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
 CELLS_ALONE, CELLS_LEAVE = 0.9, 1.45  # the same where they are to explain a misfit alone, and the chi2/N that they must come below
 VERY_ROUGH_CHI2 = 6.0  # chi2/N that a density may leave where the scores tell nothing
-RIVALS_ON_CELLS = 3  # trials that took half as much on hats, at most, which are fitted on cells beside the best
 NOTHING_OF_IT = 0.04  # of a misfit, as the square of the highest score: physics outside the catalogue looks more like some of it
 
 
@@ -81,45 +80,42 @@ def on_cells_alone(task, evidence) -> Evidence | None:
 
 
 def beside_cells(task, evidence) -> Evidence | None:
-    """The same on masses of cells, the one effect found and its near rivals fitted beside them, where these take what they promised,
-    foretell what was left out better than with hats, come near the noise, and leave nothing that scores. None elsewhere.
+    """The same with masses of cells and what a search beside them finds, where these foretell what was left out better than hats
+    and the search ends near the noise, with effects that take what they promised and nothing else that scores. None elsewhere.
 
     On hats a rough density leaves more than a weak effect, which then explains too little of the misfit to be named.
     """
     steps, current, plain = evidence.reached.steps, evidence.reached.current, evidence.plain
     near = current.chi2_per_sample < ROUGH_CHI2 and plain.chi2_per_sample < REFINE_BELOW
-    if len(steps) != 1 or task.bench.drive != "current" or evidence.adopted or plain.choices.knots is None or not near:
+    if not steps or task.bench.drive != "current" or evidence.adopted or plain.choices.knots is None or not near:
         return None
     task.say("on masses of cells", current.chi2_per_sample)
     cells = min(_fits_on_cells(task, plain), key=_cross_validation)
-    best, _, good, _ = steps[0]
-    others = sorted((t for t in good if t.name != best.name and t.drop > HALF * best.drop), key=lambda t: -t.drop)
-    tried = [best, *others[:RIVALS_ON_CELLS]]
-
-    def beside(t):
-        return lambda say: task.on(progress=say).fit_on(
-            cells, t.result.actuator, choices=cells.choices, extra=freed_beyond(t.result)
-        )
-
-    fits = together([beside(t) for t in tried], task.progress)
-    excess = excess_of(cells, NULL_CHI2)
-    good = [credited(t.candidate, f, cells, f.actuator.effect(t.name), excess) for t, f in zip(tried, fits, strict=True)]
-    good = [t for t in good if t.physical and _highest_beside(task, t) < SECOND_Z]
-    best = min(good, key=lambda t: t.bic_change, default=None)
-    if best is None or best.drop < max(MIN_DROP, HALF * excess, HALF * best.candidate.z**2):
+    if not _cross_validation(cells) < CELLS_BETTER * _cross_validation(plain):
         return None
-    foretells = _cross_validation(best.result) < CELLS_BETTER * _cross_validation(current)
-    if not (foretells and best.result.chi2_per_sample < CELLS_LEAVE and _highest_beside(task, best) < Z_THRESHOLD):
+    first, _, good, _ = steps[0]
+    worth = {t.name for t in good if t.drop > HALF * first.drop}
+    candidates = screened(cells, task.choices)
+    reached = search(task, cells, [c for c in candidates if c.name in worth], evidence.checks[1])
+    if not reached.steps or not reached.current.chi2_per_sample < CELLS_LEAVE or reached.form:
         return None
-    reached = dataclasses.replace(
-        evidence.reached, current=best.result, steps=[(best, rivals_of(best, good), good, cells)], form=None
-    )
-    return dataclasses.replace(evidence, reached=reached, raw=cells, plain=cells)
+    if len(reached.steps) == 1:  # of rivals those that leave nothing that scores
+        _, tied, good, _ = reached.steps[0]
+        tied = [t for t in tied if _highest_beside(task, t.result) < SECOND_Z]
+        if not tied:
+            return None
+        reached = dataclasses.replace(reached, current=tied[0].result, steps=[(tied[0], tied, good, cells)])
+    taken = chi2_of(cells) - chi2_of(reached.current)
+    if taken < max(MIN_DROP, HALF * excess_of(cells, NULL_CHI2), HALF * first.candidate.z**2):
+        return None
+    if _highest_beside(task, reached.current) > Z_THRESHOLD:
+        return None
+    return dataclasses.replace(evidence, reached=reached, raw=cells, plain=cells, candidates=tuple(candidates))
 
 
-def _highest_beside(task, trial) -> float:
+def _highest_beside(task, result) -> float:
     """The highest score of any further effect."""
-    return max((abs(c.z) for c in screened(trial.result, task.choices)), default=0.0)
+    return max((abs(c.z) for c in screened(result, task.choices)), default=0.0)
 
 
 def by_cells(task, evidence) -> Evidence | None:

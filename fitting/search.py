@@ -37,7 +37,7 @@ from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, rests_of
 from .instruments import RINGING, mode_as_filter
 from .screen import screen
 from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, HALF, NULL_CHI2, SILENT_CHI2, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, NULL_CHI2, SILENT_CHI2, SLOW, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
@@ -72,9 +72,10 @@ class Reached:
     form: str | None = None
 
 
-def search(task, base, candidates, check=(), ends=lambda current: False) -> Reached:
+def search(task, base, candidates, check=(), ends=lambda current: False, free_means=lambda fit, best: False) -> Reached:
     """Forward: fit the leaders, adopt the best while it earns its place; then screen again. `task`: a `Task`, of what
-    `base` was fitted to; `ends(fit)`: whether the fit with an effect that was adopted makes the rest of the search needless."""
+    `base` was fitted to; `ends(fit)`: whether the fit with an effect that was adopted makes the rest of the search needless;
+    `free_means(fit, best)`: the same of that with a slow effect, whose means are not settled, beside the best."""
     state = Reached(base, [], {})
     scored = {c.name: c for c in candidates}
     any_rest = task.choices.rest == "auto"
@@ -93,6 +94,8 @@ def search(task, base, candidates, check=(), ends=lambda current: False) -> Reac
         if not good:
             break
         best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
+        if any(free_means(t.result, best.result) for t in good if t.name in SLOW):
+            return state
         if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
             break
         if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)):

@@ -36,6 +36,9 @@ WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so 
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
+SLOW = ("creep", "magnetic_aftereffect")  # effects that go on for longer than a recording
+BEHIND = 5.0  # decades of a creep, that a mean may lack of its end
+BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
@@ -212,8 +215,12 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     else:
         found = _attributed(evidence, common, effects, swap, asked)
     form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
-    form += "".join(ZEROS_TEXT.format(e.amplitude) for e, _ in evidence.adopted if e.shapes.get("zeros"))
-    form += CREEPS_TEXT if any(_creeps_on(e, evidence) for e, _ in evidence.adopted) else ""
+    for effect, _ in evidence.adopted:
+        if effect.shapes.get("zeros"):
+            slow = _behind(effect, evidence)
+            form += BEHIND_TEXT.format(slow) if slow else ZEROS_TEXT.format(effect.amplitude)
+        elif _creeps_on(effect, evidence) and CREEPS_TEXT not in form:
+            form += CREEPS_TEXT
     form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
 
@@ -275,7 +282,7 @@ def _found(evidence):
     last group."""
     effects, groups, sizes, last = [], [], {}, []
     for effect, rivals in evidence.adopted:
-        if _creeps_on(effect, evidence):
+        if _creeps_on(effect, evidence) or _behind(effect, evidence):
             continue
         same = next((e for e in effects if e["name"] == effect.name), None)
         if same:  # within recordings and between them
@@ -296,8 +303,8 @@ def _found(evidence):
 
 
 def _creeps_on(effect, evidence) -> bool:
-    """Whether a drift within the records is a creep that was found, going on: all but a fifth of it after the mean displacement,
-    and less than a decade of it."""
+    """Whether a drift within the records is a creep that was found, going on: all but a fifth of it to one side of the mean
+    displacement, away from where all came from, and less than a decade of it."""
     actuator = evidence.reached.current.actuator
     found = "creep" in {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
     if not found or effect.name not in ("zero_drift", "thermal_drift") or not effect.columns:
@@ -305,8 +312,20 @@ def _creeps_on(effect, evidence) -> bool:
     scale = 1.0 if effect.shapes.get("own") else effect.amplitude
     drifts = scale * np.asarray([column[-1] - column[0] for column in effect.columns])
     means = np.asarray([s.reading[0].real for s in evidence.raw.spectra])
-    after = np.sum(drifts * means) > CREEPS_AFTER * np.sum(np.abs(drifts * means))
+    after = abs(np.sum(drifts * means)) > CREEPS_AFTER * np.sum(np.abs(drifts * means))
     return bool(after and np.all(np.abs(drifts) < float(actuator.effect("creep").gain) * np.abs(means)))
+
+
+def _behind(effect, evidence) -> str | None:
+    """The slow effect that was found, where zeros of the recordings are what each lacks of its end; None elsewhere."""
+    actuator = evidence.reached.current.actuator
+    found = {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
+    slow = next((name for name in SLOW if name in found), None)
+    if slow is None or not effect.shapes.get("zeros"):
+        return None
+    means = np.asarray([s.reading[0].real for s in evidence.raw.spectra])
+    most = BEHIND * float(actuator.effect("creep").gain) * np.sqrt(np.mean(means**2)) if slow == "creep" else np.inf
+    return slow if effect.amplitude < most else None
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:

@@ -15,7 +15,7 @@ from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
 from fitting.uncertainty import Estimate
-from fitting.verdict import Evidence, _creeps_on, _sizes, dominant, first_alone, too_little, unconfirmed
+from fitting.verdict import Evidence, _behind, _creeps_on, _sizes, dominant, first_alone, too_little, unconfirmed
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -58,6 +58,9 @@ def test_leaders_are_the_best_of_each_family_and_structures():
     assert names(chosen) == ["sensor_lag", "creep", "eddy_currents"]
     assert names(family(rows[0], rows, {"sensor_lag", "creep"})) == ["transport_delay"]
     assert names(family(candidate("transport_delay", 49.0), [candidate("sensor_lag", 5.0, (0, 1, 0))], set())) == ["sensor_lag"]
+    like = [candidate(n, 49.0) for n in ("second_mode", "delta_e", "creep", "backlash", "transport_delay")]
+    lags = names(family(candidate("amplifier_lag", 50.0), like, set()))  # every lag, however many others are as like
+    assert "transport_delay" in lags and len(lags) == 5
     assert leaders([candidate("creep", 2.0)]) == []
 
 
@@ -582,8 +585,13 @@ def test_rivals_that_meet_the_noise_are_compared_with_the_details_of_their_laws(
 
 @pytest.mark.parametrize(
     ("rates", "gain", "creeps"),
-    [((2e-7, 1e-7, 3e-8), 0.02, True), ((2e-7, -1e-7, 3e-8), 0.02, False), ((2e-7, 1e-7, 3e-8), 0.002, False)],
-    ids=["after the mean", "to and fro", "larger than the creep"],
+    [
+        ((2e-7, 1e-7, 3e-8), 0.02, True),
+        ((-2e-7, -1e-7, -3e-8), 0.02, True),
+        ((2e-7, -1e-7, 3e-8), 0.02, False),
+        ((2e-7, 1e-7, 3e-8), 0.002, False),
+    ],
+    ids=["after the mean", "back from a higher start", "to and fro", "larger than the creep"],
 )
 def test_a_drift_that_goes_the_way_of_a_creep_is_the_creep(rates, gain, creeps):
     effect = CLASSES["creep"](gain=gain)
@@ -598,3 +606,25 @@ def test_a_drift_that_goes_the_way_of_a_creep_is_the_creep(rates, gain, creeps):
     assert not _creeps_on(dataclasses.replace(drift, name="mains_hum"), evidence)
     reached.steps.clear()
     assert not _creeps_on(drift, evidence)
+
+
+@pytest.mark.parametrize(
+    ("name", "zeros", "slow"),
+    [
+        ("creep", 1e-6, "creep"),
+        ("creep", 1e-5, None),
+        ("magnetic_aftereffect", 1e-5, "magnetic_aftereffect"),
+        ("backlash", 1e-6, None),
+    ],
+)
+def test_means_beside_a_slow_effect_are_what_it_has_not_come_to(name, zeros, slow):
+    """Of a creep of 3 % a decade, less than five decades."""
+    effect = CLASSES["creep"](gain=0.03)
+    actuator = SimpleNamespace(effects=(SimpleNamespace(name=name),), effect=lambda name: effect)
+    reached = Reached(SimpleNamespace(actuator=actuator), [(trial(name, 1.0), (), (), None)], {})
+    evidence = SimpleNamespace(reached=reached, raw=SimpleNamespace(spectra=[SimpleNamespace(reading=np.array([3e-5 + 0j]))]))
+    own = RecordEffect("zero_drift", 20.0, zeros, 1e-9, {"zeros": 1e-5}, ())
+    assert _behind(own, evidence) == slow
+    assert _behind(dataclasses.replace(own, shapes={"own": True}), evidence) is None
+    reached.steps.clear()
+    assert _behind(own, evidence) is None

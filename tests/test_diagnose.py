@@ -9,12 +9,12 @@ import pytest
 import fitting.diagnose as module
 import fitting.rough as rough_module
 import fitting.search as search_module
-from fitting.attribute import Trial, chi2_of
+from fitting.attribute import Trial, chi2_of, rivals_of
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
-from fitting.record_level import remove_from_checks
+from fitting.record_level import RecordEffect, remove_from_checks
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
@@ -190,6 +190,82 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
     found = rough_module.on_cells_alone(Task((), bench), evidence)
     assert (found is not None) == rough
     assert not rough or (found.raw is found.plain is found.reached.current is fits[32] and not found.reached.steps)
+
+
+DROPS = {"second_mode": 1500.0, "transport_delay": 900.0, "backlash": 300.0}
+
+
+@pytest.mark.parametrize(
+    ("taken", "unknowns", "left", "named"),
+    [
+        ({"second_mode": 1.3, "transport_delay": 1.5}, 190, {}, {"second_mode"}),
+        ({"second_mode": 1.3, "transport_delay": 1.295}, 190, {}, {"second_mode", "transport_delay"}),
+        ({"second_mode": 1.3, "transport_delay": 1.295}, 190, {"transport_delay": 9.0}, {"second_mode"}),
+        ({"second_mode": 1.3, "transport_delay": 1.5}, 190, {"second_mode": 6.0}, None),  # not the whole truth
+        ({"second_mode": 1.5, "transport_delay": 1.5}, 190, {}, None),  # nor near the noise
+        ({"second_mode": 1.3, "transport_delay": 1.5}, 300, {}, None),  # cells foretell worse
+        ({"second_mode": 2.0, "transport_delay": 2.1}, 190, {}, None),  # the cells take what it promised
+    ],
+    ids=["named", "group", "no rival", "something else scores", "too much is left", "no better", "the density's"],
+)
+def test_a_weak_effect_on_a_rough_density_is_named_beside_cells(monkeypatch, bench, taken, unknowns, left, named):
+    def result(value, unknowns, knots=None, effect=None):
+        actuator = SimpleNamespace(effects=[], effect=lambda name: SimpleNamespace(free_parameters=lambda: ("gain",)), added=effect)
+        return SimpleNamespace(
+            chi2_per_sample=value, data_count=900, unknowns=unknowns, choices=Choices(knots=knots), spectra=None, bench=bench,
+            actuator=actuator, problem=SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy",))),
+        )  # fmt: skip
+
+    plain, cells = result(3.3, 100, (18, 13)), result(2.2, 190)
+    good = [
+        dataclasses.replace(trial(n, result(1.7, 110, (26, 18), n), drop), candidate=scored(n, 30.0)) for n, drop in DROPS.items()
+    ]
+    beside = [trial(n, result(value, 180, None, n), 900 * (2.2 - value)) for n, value in taken.items()]
+    beside.sort(key=lambda t: t.bic_change)
+    asked = []
+
+    def found_on_cells(task, base, candidates, check):
+        asked.append(sorted(c.name for c in candidates))
+        return Reached(beside[0].result, [(beside[0], rivals_of(beside[0], beside), beside, base)], {})
+
+    cells.unknowns = unknowns
+    scores = [scored(n, left.get(n, 2.0)) for n in DROPS]
+    monkeypatch.setattr(Task, "fit", lambda task, actuator, **more: cells)
+    monkeypatch.setattr(rough_module, "search", found_on_cells)
+    monkeypatch.setattr(
+        rough_module, "screened",
+        lambda found, choices: scores if found is cells else [scored("backlash", left.get(found.actuator.added, 2.0))],
+    )  # fmt: skip
+    reached = Reached(good[0].result, [(good[0], good[:1], good, plain)], {})
+    evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), reached=reached)
+    found = rough_module.beside_cells(Task((), bench), evidence)
+    assert (found and {t.name for t in found.reached.steps[0][1]}) == named
+    assert asked == ([["second_mode", "transport_delay"]] if unknowns < 300 else [])  # what took half as much on hats
+    assert found is None or (found.raw is found.plain is cells and found.candidates == tuple(scores))
+
+
+def test_means_are_set_free_where_they_hold_most_of_what_a_slow_effect_leaves(monkeypatch, bench):
+    def result(value, effect):
+        actuator = SimpleNamespace(effects=(SimpleNamespace(name=effect),))
+        return SimpleNamespace(
+            chi2_per_sample=value, data_count=900, actuator=actuator, problem=None, refined=None, spectra=(), choices=Choices()
+        )
+
+    ends = {"freed": 1.1, "z": 42.0}
+    own = RecordEffect("zero_drift", 42.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
+    monkeypatch.setattr(module, "zeros_score", lambda *a: (ends["z"], np.zeros(2), np.ones(2)))
+    monkeypatch.setattr(module, "zeros_of", lambda *a: [own])
+    monkeypatch.setattr(Task, "fit", lambda task, actuator, **more: result(ends["freed"], "creep"))
+    task = Task((Recording(np.arange(40.0), {"current": np.arange(40.0), "displacement": np.arange(40.0)}),), bench)
+    best = result(2.3, "magnetic_aftereffect")
+    cleaned, found = module._unsettled_means(task, [], result(2.9, "creep"), best)
+    assert found == (own, []) and cleaned.recordings[0].origin["zero"] == 1e-5
+    assert module._unsettled_means(task, [(own, [])], result(2.9, "creep"), best) is None  # once
+    assert module._unsettled_means(task, [], result(2.9, "creep"), result(1.2, "backlash")) is None
+    assert module._unsettled_means(task, [], result(6.0, "creep"), best) is None  # the best serves better
+    for changed in ({"freed": 2.1}, {"freed": 1.1, "z": 20.0}):  # they take less than half of it
+        ends.update(changed)
+        assert module._unsettled_means(task, [], result(2.9, "creep"), best) is None
 
 
 @pytest.mark.long
