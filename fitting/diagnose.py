@@ -25,6 +25,7 @@ from .search import screened, search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
 from .verdict import (
+    DRIFTS,
     SILENT_CHI2,
     WORSE,
     Z_THRESHOLD,
@@ -38,6 +39,7 @@ from .verdict import (
 RECORD_Z = 8.0
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
+NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
 MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the recordings must hold
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
 ABSORBED_VISIBILITY = 0.004
@@ -249,8 +251,8 @@ def _better_valley(task, plain, candidates, current):
 
 def _own_zeros(task, adopted, base, candidates):
     """A zero that changes from recording to recording: adopted if it promises about as much as any effect, alone meets the
-    noise, and the effects that promise as much do not serve as well. Returns the task with free means, the effect with its
-    rivals, and its fit; None elsewhere.
+    noise, and the effects that promise as much do not serve as well. Beside a drift within the recordings, which goes on between
+    them, it need only take nearly all. Returns the task with free means, the effect with its rivals, and its fit; None elsewhere.
     """
     held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
     if held or bench.output != "displacement" or _quasistatic(bench) or not base.chi2_per_sample > least_excess(base):
@@ -263,7 +265,9 @@ def _own_zeros(task, adopted, base, candidates):
     effect, *rivals = zeros_of(base.spectra, z, zeros, errors, [e.name for e, _ in adopted])
     cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
     freed = cleaned.fit(base.actuator)
-    if freed.chi2_per_sample > least_excess(freed) or chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
+    drifts = any(e.name in DRIFTS for e, _ in adopted)
+    met = freed.chi2_per_sample < least_excess(freed) or (drifts and chi2_of(freed) < chi2_of(base) - NEARLY_ALL * excess)
+    if not met or chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
         return None
     cost = chi2_of(freed) + len(zeros) * np.log(freed.data_count)
     trials = (settled(task, base, try_effect(task, base, c, excess), excess) for c in likely[:MOST_LIKELY])

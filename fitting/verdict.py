@@ -36,6 +36,7 @@ WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so 
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
+DRIFTS = ("zero_drift", "thermal_drift")
 SLOW = ("creep", "magnetic_aftereffect")  # effects that go on for longer than a recording
 BEHIND = 5.0  # decades of a creep, that a mean may lack of its end
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
@@ -285,12 +286,13 @@ def _found(evidence):
         if _creeps_on(effect, evidence) or _behind(effect, evidence):
             continue
         same = next((e for e in effects if e["name"] == effect.name), None)
+        group = any(effect.name in g for g in groups)
         if same:  # within recordings and between them
             same["parameters"] |= _record_row(effect)["parameters"]
-        elif rivals:
+        elif rivals and not group:
             groups.append([effect.name, *[r.name for r in rivals]])
             sizes |= {r.name: _record_row(r)["parameters"] for r in (effect, *rivals)}
-        else:
+        elif not group:
             effects.append(_record_row(effect))
     for best, rivals, good, _ in evidence.reached.steps:
         if len(rivals) > 1:
@@ -299,6 +301,8 @@ def _found(evidence):
             last = rivals
         else:
             effects.append(_effect_row(best, good, evidence.raw, evidence.reached.current))
+    alone = {e["name"] for e in effects}
+    groups = [g for g in groups if not (set(g) <= set(DRIFTS) and set(g) & alone)]  # its means tell a drift from its rival
     return effects, groups, sizes, last
 
 
@@ -307,7 +311,7 @@ def _creeps_on(effect, evidence) -> bool:
     displacement, away from where all came from, and less than a decade of it."""
     actuator = evidence.reached.current.actuator
     found = "creep" in {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
-    if not found or effect.name not in ("zero_drift", "thermal_drift") or not effect.columns:
+    if not found or effect.name not in DRIFTS or not effect.columns:
         return False
     scale = 1.0 if effect.shapes.get("own") else effect.amplitude
     drifts = scale * np.asarray([column[-1] - column[0] for column in effect.columns])

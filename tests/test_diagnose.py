@@ -268,6 +268,42 @@ def test_means_are_set_free_where_they_hold_most_of_what_a_slow_effect_leaves(mo
         assert module._unsettled_means(task, [], result(2.9, "creep"), best) is None
 
 
+def test_a_drift_is_told_once():
+    """Within the recordings and between them; the means may tell it from its rival."""
+    plain, whole = a_fit(15.0, 58.0), a_fit(1.0, 62.0, "thermal_drift")
+    within = RecordEffect("thermal_drift", 60.0, 1e-5, 1e-7, {"tau": 30.0}, (np.linspace(0, 1, 9),))
+    between = RecordEffect("zero_drift", 60.0, 1e-6, 1e-8, {"zeros": 1e-5}, ())
+    rival = dataclasses.replace(within, name="zero_drift", shapes={})
+    evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), adopted=((within, [rival]), (between, [])))
+    effects, groups, *_ = _found(evidence)
+    assert not effects and groups == [["thermal_drift", "zero_drift"]]
+    step = trial("thermal_drift", whole, 1000.0)
+    found = dataclasses.replace(evidence, reached=Reached(whole, [(step, [step], [step], plain)], {}))
+    effects, groups, *_ = _found(found)
+    assert [e["name"] for e in effects] == ["thermal_drift"] and not groups
+    own = dataclasses.replace(within, name="zero_drift", shapes={"own": True})
+    effects, groups, *_ = _found(dataclasses.replace(evidence, adopted=((own, []), (between, []))))
+    assert [set(e["parameters"]) for e in effects] == [{"rate", "between_recordings"}] and not groups
+
+
+@pytest.mark.parametrize(
+    ("drift", "freed", "free"), [(True, 4.0, True), (False, 4.0, False), (False, 1.0, True), (True, 150.0, False)],
+    ids=["beside a drift", "no drift", "all of it", "too little"],
+)  # fmt: skip
+def test_means_go_with_a_drift_where_they_hold_nearly_all(monkeypatch, bench, drift, freed, free):
+    own = RecordEffect("zero_drift", 90.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
+    monkeypatch.setattr(module, "zeros_score", lambda *a: (800.0, np.zeros(2), np.ones(2)))
+    monkeypatch.setattr(module, "zeros_of", lambda *a: [own])
+    ended = a_fit(freed, 60.0)
+    monkeypatch.setattr(Task, "fit", lambda task, actuator: ended)
+    base = a_fit(960.0, 55.0)
+    base.problem = base.refined = base.spectra = None
+    base.data_count = ended.data_count = 600
+    within = RecordEffect("thermal_drift", 60.0, 1e-5, 1e-7, {"tau": 30.0}, ())
+    found = module._own_zeros(Task((), bench), [(within, [])] if drift else [], base, [scored("linear_strain", 500.0)])
+    assert (found is not None) == free and (not free or found[1] == (own, []) and found[2] is ended)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("number", [29, 42], ids=["a hum that is too weak", "null"])
 def test_silent_on_random_cells(tmp_path, number):
