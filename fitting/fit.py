@@ -31,6 +31,7 @@ CALM = 0.25  # mean square of the recordings' levels in units of their prior, ab
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 LOST, AT_BOUND = 1e5, 100.0  # chi2/N from which a fit has led nowhere, and one with a parameter at its bound
 VALLEY = 0.98  # correlation from which two parameters are one
+LEARNED = "effects.learned_term."  # its coefficients are many, and held by their prior on purpose: none is named by itself
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
@@ -310,14 +311,17 @@ def recording_fits(problem, residual, recordings, bench):
 
 def valleys(found) -> str:
     """The pairs of parameters that these recordings do not tell apart, in words: their priors do, if any."""
-    pairs = [f"{' and '.join(pair.split('~'))} (correlation {value:.2f})" for pair, value in found.items() if abs(value) > VALLEY]
+    named = {pair: value for pair, value in found.items() if LEARNED not in pair}
+    pairs = [f"{' and '.join(pair.split('~'))} (correlation {value:.2f})" for pair, value in named.items() if abs(value) > VALLEY]
     return f"; a valley: only their priors part {', '.join(pairs)}" if pairs else ""
 
 
 def loose(rows) -> str:
     """The parameters that these recordings do not hold, in words, and why."""
-    found = [f"{e.name} ({e.why})" for e in rows if e.free and not e.identified]
-    return f"; not identified: {', '.join(found)}" if found else ""
+    loose = [e for e in rows if e.free and not e.identified]
+    found = [f"{e.name} ({e.why})" for e in loose if not e.name.startswith(LEARNED)]
+    held = "; a prior holds the coefficients of the learned term" if len(found) < len(loose) else ""
+    return (f"; not identified: {', '.join(found)}" if found else "") + held
 
 
 def guessed(recordings, bench) -> str:

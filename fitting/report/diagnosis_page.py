@@ -18,6 +18,11 @@ TONES = {
     "data_problem": "bad",
 }
 RUN_PLACEBO = "To run it: add --placebo 20 to the command that made this folder."
+FRAMED = (
+    "The framed block need not be the darkest. The shades are of single effects of the catalogue, to first order; the frame stands where a "
+    "smooth function that was fitted jointly with all else foretells recordings left out best, or, of those that foretell them about as well, "
+    "where the rest of the model hides it least."
+)
 FORETOLD = 1.4  # times its noise, up to which a check recording is foretold
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
@@ -235,6 +240,7 @@ def _where(found, facts, base, sketch, output, drive):
     marks |= {found["unknown"]["block"]: "acts most like this"} if found["unknown"] else {}
     return section(
         "Where simulation and recordings differ",
+        part(text=FRAMED if "function" in (found["unknown"] or {}) else ""),
         sketch(where.get("by_block"), pictures.block_map, where, marks, drive),
         *headed("Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base)),
         *headed(
@@ -298,6 +304,8 @@ def _ranking(found, facts, sketch):
 
 def repair_words(found) -> str:
     """What to call the model with the additions of the search."""
+    if "function" in (found["unknown"] or {}):
+        return "the model with the learned function"
     return {"unknown_at": "the nearest repair tried", "group": "the model with the leading rival"}.get(
         found["verdict"], "the repaired model"
     )

@@ -18,7 +18,7 @@ def validity(fit) -> tuple[str, str, str, str]:
     """(tone, headline, advice, doubt about the error bars) of a fit; the doubt is a key of `tables.DOUBTS`."""
     chi2 = fit["chi2_per_sample"]
     bound = [n for n, p in fit["parameters"].items() if p["at_bound"]]
-    loose = [n for n, p in fit["parameters"].items() if p["free"] and not p["identified"]]
+    loose = [n for n, p in fit["parameters"].items() if p["free"] and not p["identified"] and not n.startswith(tables.LEARNED)]
     worst = max((r["chi2_per_sample"] for r in fit["recordings"]), default=chi2)
     ask = "Run the diagnosis on the same files; it says what physics is missing, and where."
     if not fit["converged"]:

@@ -10,8 +10,8 @@ THRESHOLD = 5.5  # of |z|, as the search uses it
 
 
 def block_map(where, marks, drive: str, stem: str = "blocks"):
-    """The chain of blocks, each shaded by the share of the misfit that its best effect could explain; `marks`: block ->
-    what the verdict says of it."""
+    """The chain of blocks, each shaded by the share of what is above the noise that its best effect could explain; `marks`:
+    block -> what the verdict says of it."""
     shares = where["by_block"]
     shown = [b for b in BLOCKS if b in shares or b in marks]
     wide = 1.0 / max(len(shown), 1)
@@ -37,8 +37,8 @@ def block_map(where, marks, drive: str, stem: str = "blocks"):
                     arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1},
                 )
         caption = (
-            f"The chain from {drive} to reading. The percentage is the share of the misfit that the best single effect of the block could take, to first "
-            "order; blocks overlap, so shares do not add up. A thick frame marks the blocks of which the verdict speaks."
+            f"The chain from {drive} to reading. The percentage is the share of what is above the noise that the best single effect of the block could "
+            "take, to first order; blocks overlap, so shares do not add up. A thick frame marks the blocks of which the verdict speaks."
         )
         words = ", ".join(f"{b} {percent(shares.get(b, 0.0))}" + (f" ({marks[b]})" if b in marks else "") for b in shown)
         return picture(figure, stem, "Block map: what each block could explain", caption, words)

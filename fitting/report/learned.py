@@ -6,7 +6,8 @@ from . import tables
 from .page import part
 from .style import BLUE, GREEN, MUTED, PALE, VERMILION, canvas, percent, picture, plain, styled, unit_text
 
-SHOWN = 8  # boundaries of the table
+SHOWN = 8  # boundaries of the table, and any further one that was fitted
+FITTED = ("fitted jointly: χ²/N", "left out: χ²/N")
 FINE = {"m": (1e9, "nm"), "A/m": (1.0, "A/m"), "A": (1e3, "mA"), "T": (1e3, "mT")}
 
 
@@ -46,25 +47,34 @@ def _with_unit(value, unit):
 def _boundaries(unknown):
     rivals = {(r["block"], tuple(r["variables"])) for r in unknown["rivals"]}
     rows = []
-    for b in unknown["boundaries"][:SHOWN]:
-        place = (b["block"], tuple(b["variables"]))
-        kept = place == (unknown["block"], tuple(unknown["variables"]))
-        said = "kept" if kept else "not told from it" if place in rivals else ""
+    kept = (unknown["block"], tuple(unknown["variables"]))
+    told = any("left_out" in b for b in unknown["boundaries"])  # a folder of before does not say which were tried
+    for rank, b in enumerate(unknown["boundaries"]):
+        place, tried = (b["block"], tuple(b["variables"])), b.get("left_out") is not None
+        if rank >= SHOWN and not tried and place != kept:
+            continue
+        said = (
+            "kept"
+            if place == kept
+            else "not told from it"
+            if place in rivals
+            else "tried, worse"
+            if tried
+            else "not tried"
+            if told
+            else ""
+        )
+        worth = [plain(b["chi2_per_sample"]), plain(b["left_out"])] if told else []
         rows.append(
-            [
-                b["block"],
-                _joined(b["variables"]),
-                plain(b["evidence"]),
-                percent(b["share"]),
-                percent(b["visibility"]),
-                said,
-            ]
+            [b["block"], _joined(b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"]), *worth, said]
         )
     note = (
-        "To first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit is with a smooth function there than "
-        "without. Visible: the part of it that density and constants cannot make."
+        "Evidence, share and visibility are to first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit "
+        "is with a smooth function there than without. Visible: the part of it that density and constants cannot make. The best by evidence "
+        "were fitted jointly with all else; what decides among these is the χ²/N of recordings left out one at a time, and of those that come near "
+        "each other there, which is more visible."
     )
-    head = ["block", "function of", "evidence", "share explained", "visible", "choice"]
+    head = ["block", "function of", "evidence", "share explained", "visible", *(FITTED if told else ()), "choice"]
     return part(table=tables.table("Where a smooth function would serve", head, rows, note))
 
 

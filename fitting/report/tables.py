@@ -6,6 +6,7 @@ from pathlib import Path
 from ..reach import beyond_text
 from .style import plain, scale_of, unit_text
 
+LEARNED = "effects.learned_term."  # its function is drawn: its coefficients say nothing one by one
 CHANNEL_OF = {"m": "displacement", "T": "flux_density", "A/m": "magnetization", "C/m^2": "polarization"}
 
 
@@ -48,7 +49,7 @@ def parameters(fit, doubt: str = "", caption: str = "Fitted parameters", bounds=
     (lowest, highest)."""
     free, fixed = [], []
     for name, p in fit["parameters"].items():
-        if name.startswith("effects.learned_term."):  # its function is drawn
+        if name.startswith(LEARNED):
             continue
         if not p["free"]:
             fixed.append([name, p.get("meaning", ""), plain(p["value"], 6), unit_text(p["unit"])])
@@ -84,7 +85,7 @@ def parameters(fit, doubt: str = "", caption: str = "Fitted parameters", bounds=
 def correlations(fit) -> dict | None:
     """The correlation matrix of the fitted constants, those beyond 0.9 marked; None with less than two constants."""
     pairs = fit["correlations"]
-    names = [n for n in dict.fromkeys(n for pair in pairs for n in pair.split("~")) if not n.startswith("effects.learned_term.")]
+    names = [n for n in dict.fromkeys(n for pair in pairs for n in pair.split("~")) if not n.startswith(LEARNED)]
     if len(names) < 2:
         return None
     rows = []

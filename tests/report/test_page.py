@@ -1,5 +1,6 @@
 """Every report: one file, offline, without script, small, well formed, and told to those who hear it."""
 
+import dataclasses
 import html.parser
 import json
 import re
@@ -11,12 +12,14 @@ import xml.dom.minidom
 import numpy as np
 import pytest
 
+from fitting.locate import where
 from fitting.report import rebuild, store
 from fitting.report.diagnosis_page import _shifts, _size, headline, interval, placebo_section, tone
 from fitting.report.fit_page import diagnose_command, sentence, validity
 from fitting.report.plane import never_switched
 from fitting.report.tables import interval as interval_of
 from fitting.report.tables import to_error
+from fitting.screen import Candidate
 from magjax.errors import ConfigurationError
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
@@ -340,6 +343,55 @@ def test_messages_read_as_sentences():
         == "Excess loss: χ²/N falls. check: 48.1 → 46 nm; 1e-3 m."
     )
     assert sentence("") == ""
+
+
+def unknown_page(folders, tmp_path, boundaries):
+    """The page of an `unknown_at` with a learned function, among these boundaries."""
+    found = json.loads((folders["unknown_at"] / "diagnosis.json").read_text())
+    line = {"at": None, "value": [0.0, 2e-7], "low": [-1e-7, 1e-7], "high": [1e-7, 3e-7]}
+    found["unknown"] |= {
+        "block": "sensor", "variables": ["reading"], "variable_units": ["m"], "unit": "m", "share": 0.9, "seen": [[0.0, 1e-6]], "rms": 1e-7,
+        "left_out": [30.0, 13.0], "bends_over": 0.1, "function": {"x": [0.0, 1e-6], "slices": [line]}, "boundaries": boundaries,
+        "rivals": [{"block": "coil", "variables": ["field"]}],
+    }  # fmt: skip
+    found["repaired"] = found["base"]
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    shutil.copy(folders["unknown_at"] / "report.npz", tmp_path)
+    return rebuild(tmp_path).read_text(encoding="utf-8")
+
+
+def test_an_unknown_says_which_boundaries_were_tried_and_why_one_is_framed(folders, tmp_path):
+    def boundary(block, variables, chi2, left_out):
+        return {"block": block, "variables": variables, "evidence": 400.0, "share": 0.6, "visibility": 0.4, "chi2_per_sample": chi2, "left_out": left_out}  # fmt: skip
+
+    rows = [
+        boundary("mechanics", ["stretch"], 1.4, 19.0),
+        boundary("sensor", ["reading"], 1.19, 13.0),
+        boundary("source", ["current"], None, None),
+        boundary("coil", ["field"], 1.2, 13.5),
+    ]
+    page = unknown_page(folders, tmp_path, rows)
+    table = page.split("Where a smooth function would serve</caption>")[1].split("</table>")[0]
+    said = [re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row) for row in table.split("<tr>")[2:]]
+    assert [row[-3:] for row in said] == [
+        ["1.4", "19", "tried, worse"],
+        ["1.19", "13", "kept"],
+        ["–", "–", "not tried"],
+        ["1.2", "13.5", "not told from it"],
+    ]
+    assert "need not be the darkest" in page and ">The model with the learned function<" in page
+    older = unknown_page(
+        folders, tmp_path, [{k: b[k] for k in ("block", "variables", "evidence", "share", "visibility")} for b in rows]
+    )
+    assert "not tried" not in older and "left out: χ²/N" not in older  # a folder of before does not say
+
+
+def test_a_block_is_shaded_by_its_share_of_what_is_above_the_noise(poor, fitted, runs):
+    excess = (poor.chi2_per_sample - 1) * poor.data_count
+    half, all_of_it = (Candidate("x", block, 9.0, 0.5, 0.1, {}, drop, 0.1, False) for block, drop in (("coil", 0.5 * excess), ("sensor", 9 * excess)))  # fmt: skip
+    assert where(poor, [all_of_it, half], runs[0], "displacement")["by_block"] == pytest.approx({"sensor": 1.0, "coil": 0.5})
+    weak = dataclasses.replace(half, predicted_chi2_drop=3.0)  # where only noise is left its own scatter is what it is measured by
+    assert where(fitted, [weak], runs[0], "displacement")["by_block"]["coil"] < 0.2
 
 
 def test_many_recordings_stay_below_a_megabyte(folders, tmp_path):
