@@ -159,17 +159,35 @@ def _size(parameters) -> str:
 def _groups(found, facts):
     if not found["groups"]:
         return None
-    rows = []
+    rows, ties = [], found.get("ties", {})
     for number, group in enumerate(found["groups"], 1):
         for place, name in enumerate(group, 1):
             about = facts.get(name, {})
             size = _size(found.get("rivals", {}).get(name, {}))
-            rows.append([words(name), number, place, about.get("block", ""), size, about.get("signature", "")])
-    text = "Each of these would repair the model about as well as the others; to name one from these recordings would be a guess."
-    head = ["rival", "group", "rank in its group", "block", "size, were it this", "how it shows"]
+            row = [words(name), number, place, about.get("block", ""), size]
+            tie = ties.get(name, {"chi2_per_sample": None, "why": ""})
+            why = tie["why"] or ("the best" if name in ties else "")
+            row += [plain(tie["chi2_per_sample"]), said_of(why)] if ties else []
+            rows.append([*row, about.get("signature", "")])
+    text = "Each of these repairs the model, and to name one from these recordings would be a guess."
+    text += " Why each is not told from the best stands beside it; χ²/N is that of a fit with it." if ties else ""
+    head = [
+        "rival",
+        "group",
+        "rank in its group",
+        "block",
+        "size, were it this",
+        *(("χ²/N", "why it is in the group") if ties else ()),
+        "how it shows",
+    ]
     return section(
         "Not told apart by these recordings", part(text=text, table=tables.table("Rivals, most likely first", head, rows))
     )
+
+
+def said_of(text: str) -> str:
+    """A phrase of the search in the signs of the page."""
+    return text.replace("chi2", "χ²")
 
 
 def _unknown(found, sketch):
@@ -253,10 +271,16 @@ def power(candidate, facts) -> str:
     """Probability that these recordings would show the effect at the top of its typical range."""
     typical = facts.get(candidate["name"], {}).get("typical")
     visible = candidate["smallest_visible"]
-    if not typical or not visible or not math.isfinite(visible):
+    if not typical or not visible or tried_at(candidate) is not None or not math.isfinite(visible):
         return "–"
     z = SEEN_AT * typical / visible
     return percent(0.5 * (1 + math.erf((z - pictures.THRESHOLD) / math.sqrt(2))))
+
+
+def tried_at(candidate) -> float | None:
+    """The finite amplitude at which a candidate was scored, None where its score is to first order."""
+    same = candidate["amplitude"] == candidate["smallest_visible"]  # so it was stored before it was told
+    return candidate.get("tried_at", candidate["amplitude"] if same else None)
 
 
 def _ranking(found, facts, sketch):
@@ -272,8 +296,11 @@ def _ranking(found, facts, sketch):
         fell = "not fitted" if drop is None else plain(drop) if drop >= 0 else f"rose by {plain(-drop)}"
         strong = "–" if c["name"] in found["absorbed"] else power(c, facts)
         bic = plain(c["bic_change"]) if c["bic_change"] is not None else ""
-        rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), f"{plain(c['amplitude'])}{unit}",
-                     f"{plain(c['smallest_visible'])}{unit}", strong, plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
+        finite = tried_at(c)
+        size = f"{plain(c['amplitude'])}{unit}" if finite is None else f"tried at {plain(finite)}{unit}"
+        seen = f"{plain(c['smallest_visible'])}{unit}" if finite is None else "–"
+        rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), size, seen, strong,
+                     plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
     head = [
         "effect",
         "block",
@@ -289,8 +316,15 @@ def _ranking(found, facts, sketch):
     note = (
         "z: score in standard deviations. Visibility: what share of its mark the base model cannot imitate. Visible from: amplitude seen at five "
         "standard deviations. Power: probability that these recordings would show the effect at the top of its typical range. Achieved: what "
-        "a fit with the effect took, that of an adopted one as it ended; where χ² rose, the fit did not settle."
+        "a fit with the effect took, that of an adopted one as it ended, on a density that may be finer by then than its rivals'; where χ² rose, "
+        "the fit did not settle."
     )
+    if any(tried_at(c) is not None for c in ranked):
+        note += (
+            " Tried at: scored at this amplitude, for it has no mark to first order; from where it would be visible is not known."
+        )
+    if any(c["z"] == 0 and c["amplitude"] < 0 for c in ranked):
+        note += " A z of 0 beside an amplitude below 0: the misfit asks for the sign that the effect cannot have."
     absorbed = ", ".join(words(n) for n in found["absorbed"])
     text = f"These recordings could not show {absorbed}: the density imitates them." if absorbed else ""
     drawn = sketch(ranked, pictures.ranking, ranked)

@@ -187,7 +187,8 @@ def run_diagnose(arguments) -> int:
     else:
         print(found)
         for row in found.candidates[:8]:
-            print(f"  {row.name:26s} z = {row.z:8.1f}   visible from {row.smallest_visible:.3g}")
+            seen = f"visible from {row.smallest_visible:.3g}" if row.tried_at is None else f"tried at {row.tried_at:.3g}"
+            print(f"  {row.name:26s} z = {row.z:8.1f}   {seen}")
         if found.placebo:
             print(placebo_text(found.placebo))
         if folder:

@@ -260,6 +260,38 @@ def test_the_ranking_says_what_a_fit_did_and_no_power_of_what_is_absorbed(diagno
     assert power[name] == "–" and sum(p.endswith("%") for p in power.values()) > 10
 
 
+def test_what_was_scored_at_a_finite_amplitude_has_no_visible_one(folders, tmp_path):
+    found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
+    first, second, third, *_ = found["candidates"]
+    first |= {"amplitude": 0.5, "smallest_visible": 0.5, "tried_at": 0.5}
+    second |= {"amplitude": 1.24, "smallest_visible": 1.24}
+    del second["tried_at"]  # as it was stored before it was told
+    third |= {"z": 0.0, "amplitude": -0.001}
+    shutil.copy(folders["attributed"] / "report.npz", tmp_path)
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    page = rebuild(tmp_path).read_text(encoding="utf-8")
+    rows = [re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row) for row in re.findall("<tr>.*?</tr>", page)]
+    said = {row[0]: row[4:7] for row in rows if len(row) == 10}
+    for c, size in ((first, "tried at 0.5"), (second, "tried at 1.24")):
+        assert said[c["name"].replace("_", " ")][0].startswith(size) and said[c["name"].replace("_", " ")][1:] == ["–", "–"]
+    assert "no mark to first order" in page and "the sign that the effect cannot have" in page
+    plain_page = (folders["attributed"] / "report.html").read_text(encoding="utf-8")
+    assert "no mark to first order" not in plain_page and "cannot have" not in plain_page
+
+
+def test_each_rival_says_why_it_is_not_told_from_the_best(folders, tmp_path):
+    found = json.loads((folders["group"] / "diagnosis.json").read_text())
+    names = found["groups"][0]
+    assert "why it is in the group" not in (folders["group"] / "report.html").read_text(encoding="utf-8")  # where it is not known
+    whys = ("", "it meets the noise too, 30 in chi2 behind")
+    found["ties"] = {n: {"chi2_per_sample": 1.03 + k, "why": why} for k, (n, why) in enumerate(zip(names, whys, strict=True))}
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    page = rebuild(tmp_path).read_text(encoding="utf-8")
+    for said in ("<td>1.03</td><td>the best</td>", "<td>2.03</td><td>it meets the noise too, 30 in χ² behind</td>"):
+        assert said in page
+    assert "about as well as the others" not in page
+
+
 def test_loops_say_what_was_added_and_what_the_band_is(diagnoses, folders, tmp_path):
     found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
     found["repaired"]["parameters"]["effects.excess_loss.k"] = {**found["repaired"]["parameters"]["mechanics.xi"], "unit": "1"}
