@@ -348,7 +348,7 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
         wrong = swapped(problem.spectra) or "check signs and units of the recordings, and the bench file"
         named = Path(max(rows, key=lambda r: np.nan_to_num(r.chi2_per_sample, nan=np.inf)).file).name
         size = (
-            f"the residual is {np.sqrt(chi2n):.3g} times the noise"
+            f"what repeats is {np.sqrt(chi2n):.3g} times its noise"
             if np.isfinite(chi2n)
             else "the simulation fails at its constants"
         )
@@ -361,16 +361,17 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
     worst = max(rows, key=lambda r: r.chi2_per_sample)
     bound = [e.name for e in parameters if e.at_bound and not e.name.startswith("effects.")]  # where a law's shape ends it may stay
     if bound:
-        far = f", and the residual is {np.sqrt(chi2n):.3g} times the noise (worst: {Path(worst.file).name})" if chi2n > 2 else ""
+        far = f", and what repeats is {np.sqrt(chi2n):.3g} times its noise (worst: {Path(worst.file).name})" if chi2n > 2 else ""
         return f"{', '.join(bound)} sits at its bound{far}; free another parameter or check signs, units and the bench file"
     if chi2n < 1.1 and worst.chi2_per_sample < 1.6:
         return "the recordings are met to their noise; the error bars hold"
     if chi2n > 2:
         return (
-            f"the residual is {np.sqrt(chi2n):.1f} times the noise (worst: {worst.frequency:.4g} Hz), so the error bars do not hold and no "
+            f"what repeats is {np.sqrt(chi2n):.1f} times its noise (worst: {worst.frequency:.4g} Hz), so the error bars do not hold and no "
             "parameter is physical yet; run magjax diagnose on the same files"
         )
+    alone = f", and {worst.chi2_per_sample:.3g} in {Path(worst.file).name}" if chi2n < 1.1 else ""
     return (
-        f"chi2/N = {chi2n:.2f}, a little above the noise; the error bars are too narrow: a rough density, or a weak effect "
+        f"chi2/N = {chi2n:.2f}{alone}, a little above the noise; the error bars are too narrow: a rough density, or a weak effect "
         "(magjax diagnose tells which)"
     )

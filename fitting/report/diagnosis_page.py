@@ -2,11 +2,14 @@
 
 import json
 import math
+import re
+from pathlib import Path
 
 from . import found as pictures
 from . import learned, loops, misfit, plane, tables
-from .fit_page import AT_NOISE, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
+from .fit_page import AT_NOISE, DEFINED, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
+from .residuals import repeating
 from .style import percent, plain, scale_of, terms_in, unit_text
 
 TONES = {
@@ -18,6 +21,7 @@ TONES = {
     "data_problem": "bad",
 }
 RUN_PLACEBO = "To run it: add --placebo 20 to the command that made this folder."
+HERE = re.compile(r"; run magjax diagnose on the same files| \(magjax diagnose tells which\)")  # a fit's advice, followed here
 FRAMED = (
     "The framed block need not be the darkest. The shades are of single effects of the catalogue, to first order; the frame stands where a "
     "smooth function that was fitted jointly with all else foretells recordings left out best, or, of those that foretell them about as well, "
@@ -51,7 +55,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         _shifts(found),
         placebo_section(found.get("placebo"), "data_problem" if broken else found["verdict"]),
         *_models(found, evidence, sketch, drive),
-        section("Floors", part(table=_floors(found, output))),
+        section("Floors", part(table=_floors(found, base, output))),
     ]
     count = len(fit.get("recordings", []))
     plural = lambda n, what: f"{n} {what}{'' if n == 1 else 's'}"
@@ -68,7 +72,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     return {
         "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else tone(found),
         "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
-        "message": [said or sentence(spoken(found["message"], names))], "sections": [s for s in sections if s],
+        "message": [said or sentence(spoken(found["message"], names))], "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
     }  # fmt: skip
 
 
@@ -97,7 +101,7 @@ def still_left(found) -> str:
     if chi2 > AT_NOISE:
         said.append(f"a misfit of χ²/N = {plain(chi2)} is left")
     elif worst and worst["chi2_per_sample"] > WORST_AT_NOISE:
-        said.append(f"one recording is left with a misfit of χ²/N = {plain(worst['chi2_per_sample'])}")
+        said.append(f"{Path(worst['file']).name} is left with a misfit of χ²/N = {plain(worst['chi2_per_sample'])}")
     missed = [r for r in found["check"] if r["noise_rms"] and r["rms_after"] > FORETOLD * r["noise_rms"]]
     if missed:
         r = max(missed, key=lambda r: r["rms_after"] / r["noise_rms"])
@@ -120,7 +124,7 @@ def headline(found) -> str:
         found_beside = f"; found beside it: {beside}" if beside else ""
         return f"Something is missing, and these recordings cannot say which: {names}{found_beside}"
     if verdict == "nothing_missing" and (left := still_left(found)):
-        return f"Nothing of the catalogue is missing; {left}"
+        return f"No effect of the catalogue was found{_judged(found)}; {left}"
     if verdict == "unknown_at":
         where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
         return f"Something is missing that no effect of the catalogue explains; it acts most like the block {where}"
@@ -131,9 +135,22 @@ def headline(found) -> str:
     }.get(verdict, words(verdict))
 
 
+def _judged(found) -> str:
+    """How many effects could be judged: the density does not hide them."""
+    number = len(found["candidates"])
+    absorbed = {c["name"] for c in found["candidates"]} & set(found["absorbed"])
+    return f" ({number - len(absorbed)} of {number} could be judged)" if number else ""
+
+
+def _doubt(fit) -> str:
+    """What is wrong with the standard errors of a fit, "" where nothing is or there is none."""
+    return validity(fit)[3] if fit else ""
+
+
 def _named(found, facts):
     if not found["effects"]:
         return None
+    doubt = _doubt(found["repaired"])
     rows, laws = [], []
     for e in found["effects"]:
         rows.append([words(e["name"]), e["block"], _size(e["parameters"]), plain(e["confidence"], 2)])
@@ -143,7 +160,11 @@ def _named(found, facts):
     note = "Confidence: probability of the effect among those that were fitted, times the share of the excess misfit that it takes."
     return section(
         "What was left out",
-        part(table=tables.table("Effects found", ["effect", "block", "size", "confidence"], rows, note)),
+        part(
+            table=tables.table(
+                "Effects found", ["effect", "block", f"size (± {doubt})" if doubt else "size", "confidence"], rows, note
+            )
+        ),
         part(bullets=laws),
     )
 
@@ -243,10 +264,12 @@ def added(found) -> str:
 
 
 def _loops(found, base, repaired, sketch, output, drive):
-    if not base or not base["chosen"].size:
-        return None
     title = "Fitted recordings, before and after" if repaired else "Measured and fitted loops"
-    return section(title, sketch(base, loops.loops, base, output, drive, repaired or None, added(found)))
+    return section(
+        title,
+        part(table=tables.before_and_after(found["base"], found["repaired"], (base, repaired))),
+        sketch(base and base["chosen"].size, loops.loops, base, output, drive, repaired or None, added(found)),
+    )
 
 
 def _where(found, facts, base, sketch, output, drive):
@@ -440,14 +463,14 @@ def _models(found, evidence, sketch, drive):
     if repaired:
         yield section(
             sentence(repair_words(found)).rstrip("."),
-            part(text=sentence(repaired["message"])),
+            part(text=sentence(HERE.sub("", repaired["message"]))),
             *(
                 part(table=t)
                 for t in tables.parameters(repaired, validity(repaired)[3], f"Parameters of {repair_words(found)}", bounds_of(best))
             ),
             part(table=tables.correlations(repaired)),
             part(text=plane.never_switched(best)),
-            sketch(best, plane.mass_map, best),
+            sketch(best, plane.mass_map, best, doubt=_doubt(repaired)),
             sketch(best.get("inside"), loops.inside, best, drive),
             convergence_part(sketch, repaired),
         )
@@ -457,28 +480,31 @@ def _models(found, evidence, sketch, drive):
         plain_tables = tables.parameters(base, doubt, "Parameters of the plain model", bounds_of(evidence.get("base", {})))
         yield section(
             "A fit to them as they are (not to be used)" if spoilt else "The plain model",
-            part(text=sentence("" if spoilt else base["message"])),
+            part(text=sentence("" if spoilt else HERE.sub("", base["message"]))),
             *(part(table=t) for t in plain_tables[: 1 if repaired else 2]),
-            part(table=tables.recordings(base)),
+            part(table=tables.recordings(base, evidence.get("base"))),
             *(
                 []
                 if repaired
                 else [
                     part(text=plane.never_switched(best)),
-                    sketch(best, plane.mass_map, best),
+                    sketch(best, plane.mass_map, best, doubt=doubt),
                     sketch(best.get("inside"), loops.inside, best, drive),
                 ]
             ),
         )
 
 
-def _floors(found, output):
+def _floors(found, base, output):
     fine, unit = scale_of(output)[2:]
     meaning = {
-        "noise_rms": "noise between the harmonics", "solver_rms": "change of the simulation when its step is halved",
+        "noise_rms": "noise of one sample, from what lies between the harmonics", "solver_rms": "change of the simulation when its step is halved",
         "density_rms": "what a smooth density may leave",
     }  # fmt: skip
     rows = [
         [meaning.get(k, words(k)), f"{plain(fine * v)} {unit}"] for k, v in found["floors"].items() if isinstance(v, (int, float))
     ]
+    if base and rows:
+        noise = float((repeating(base)[1] ** 2).mean() ** 0.5)
+        rows.insert(1, ["noise of what repeats, in all harmonics of a recording", f"{plain(fine * noise)} {unit}"])
     return tables.table("The floors below which nothing is claimed", ["floor", "rms"], rows) if rows else None

@@ -40,6 +40,7 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
         "noise": noise,
         "chi2": np.array([r.chi2_per_sample for r in result.recordings]),
         "rms": np.array([np.sqrt(np.mean(r**2)) for r in residuals]),
+        "stroke": np.array([s.peak_to_peak for s in spectra]),
         "chosen": np.array(chosen),
         "loops": {str(k): _loop(spectra[k], misfit[k]) for k in chosen},
         "zoom": {str(k): _zoom(spectra[k], misfit[k]) for k in _extremes(result)[:2]},

@@ -65,7 +65,7 @@ def render(target: Path, page: dict, reproduce: str, versions: str = "", source:
             write_atomically(shapes / f"{picture.stem}.svg", '<?xml version="1.0" encoding="utf-8"?>\n' + picture.svg)
             write_atomically(shapes / f"{picture.stem}.png", picture.png)
     template = Environment(autoescape=True, trim_blocks=True).from_string(TEMPLATE.read_text(encoding="utf-8"))
-    words = {"advice": "", "command": "", **page, "reproduce": reproduce, "versions": versions}
+    words = {"advice": "", "command": "", "defined": "", **page, "reproduce": reproduce, "versions": versions}
     text = template.render(**words, source=source or target.with_suffix(".json").name, drawn=bool(pictures))
     write_atomically(target, text)
     return target

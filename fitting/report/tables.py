@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 from ..reach import beyond_text
+from .residuals import repeating, strokes
 from .style import plain, scale_of, unit_text
 
 LEARNED = "effects.learned_term."  # its function is drawn: its coefficients say nothing one by one
@@ -23,12 +24,17 @@ def to_error(value: float, error: float) -> str:
     return plain(value, min(digits, 10))
 
 
-def flags(p) -> str:
-    """What a reader must know of one estimate."""
-    said = [("at bound", p["at_bound"]), ("not identified", not p["identified"])]
-    return ", ".join(text for text, on in said if on) or ("ok" if p["free"] else "")
+def flags(p, doubt: str = "") -> str:
+    """Whether one estimate is identified, with the doubt about the error that says so."""
+    said = [("at bound", p["at_bound"]), ("no", not p["identified"])]
+    sure = "yes" + (f" (errors {doubt})" if doubt else "")
+    return ", ".join(text for text, on in said if on) or (sure if p["free"] else "")
 
 
+REPEATING = (
+    "Rms all. Noise and residual of a sample are those of the readings as recorded; the repeating misfit is what of the residual comes back every "
+    "period, in the harmonics, where averaging leaves less noise."
+)
 DOUBTS = {
     "": "",
     "not valid": "Standard errors assume that only noise is left. It is not, so the true errors are larger by an unknown amount.",
@@ -62,7 +68,7 @@ def parameters(fit, doubt: str = "", caption: str = "Fitted parameters", bounds=
             plain(p["stderr"], 2),
             interval(p, *(bounds or {}).get(name, ())),
             unit_text(p["unit"]),
-            flags(p),
+            flags(p, doubt),
         ]
         free.append(row)
     error, span = (f"{name} ({doubt})" if doubt else name for name in ("std. error", "95 % interval"))
@@ -71,7 +77,7 @@ def parameters(fit, doubt: str = "", caption: str = "Fitted parameters", bounds=
         tables.append(
             table(
                 caption,
-                ["parameter", "meaning", "start", "value", error, span, "unit", "flags"],
+                ["parameter", "meaning", "start", "value", error, span, "unit", "identified?"],
                 free,
                 DOUBTS[doubt],
                 code=True,
@@ -104,17 +110,45 @@ def correlations(fit) -> dict | None:
     return table("Correlations of the fitted constants", ["", *names], rows, note, code=True)
 
 
-def recordings(fit) -> dict:
-    """Every recording with its noise and its misfit."""
+def recordings(fit, evidence=None) -> dict:
+    """Every recording with its noise and its misfit; with the `evidence` of the fit also what of the misfit repeats."""
     rows = []
-    for r in fit["recordings"]:
+    known = bool(evidence) and len(evidence["name"]) == len(fit["recordings"])
+    repeats = list(zip(*repeating(evidence), strokes(evidence), strict=True)) if known else []
+    for k, r in enumerate(fit["recordings"]):
         fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
+        more = [f"{plain(fine * v)} {unit}" for v in repeats[k][:2]] + [percent_of(*repeats[k][::2])] if known else []
         rows.append([Path(r["file"]).name, plain(r["frequency"], 4), r["periods"], f"{plain(fine * r['noise_rms'])} {unit}",
-                     f"{plain(fine * r['residual_rms'])} {unit}", plain(r["chi2_per_sample"]), r["sha256"][:12]])  # fmt: skip
-    head = ["recording", "frequency / Hz", "periods", "noise rms", "residual rms", "χ²/N", "sha256 begins"]
+                     f"{plain(fine * r['residual_rms'])} {unit}", *more, plain(r["chi2_per_sample"]), r["sha256"][:12]])  # fmt: skip
+    more = ["repeating misfit", "its noise", "of the stroke"] if known else []
+    head = ["recording", "frequency / Hz", "periods", "noise of a sample", "residual of a sample", *more, "χ²/N", "sha256 begins"]
+    note = REPEATING if known else ""
     if not any(row[-1] for row in rows):  # recordings that were never files
         head, rows = head[:-1], [row[:-1] for row in rows]
-    return table("Noise and misfit of each recording", head, rows, code=True)
+    return table("Noise and misfit of each recording", head, rows, note, code=True)
+
+
+def percent_of(part: float, whole: float) -> str:
+    """A small part of a whole in percent, to two digits."""
+    return f"{plain(100 * part / whole, 2)} %" if whole > 0 else "–"
+
+
+def before_and_after(base, repaired, found) -> dict | None:
+    """What each recording leaves before and after a repair; `found`: the evidence of both, where it is kept. None without both."""
+    pairs = list(zip(base["recordings"], repaired["recordings"], strict=False)) if base and repaired else []
+    if not pairs or [Path(a["file"]).name for a, _ in pairs] != [Path(b["file"]).name for _, b in pairs]:
+        return None
+    known = all(len(e.get("name", ())) == len(pairs) for e in found)
+    repeats = [repeating(e)[0] for e in found] if known else []
+    rows = []
+    for k, (a, b) in enumerate(pairs):
+        fine, unit = scale_of(CHANNEL_OF.get(a["unit"], "displacement"))[2:]
+        more = [f"{plain(fine * row[k])} {unit}" for row in repeats] if known else []
+        rows.append([Path(a["file"]).name, f"{plain(fine * a['noise_rms'])} {unit}", *(f"{plain(fine * r['residual_rms'])} {unit}" for r in (a, b)),
+                     *more, *(plain(r["chi2_per_sample"]) for r in (a, b))])  # fmt: skip
+    more = ["repeating misfit before", "after"] if known else []
+    head = ["recording", "noise of a sample", "residual of a sample before", "after", *more, "χ²/N before", "after"]
+    return table("Misfit of each recording, before and after", head, rows, REPEATING if known else "", code=True)
 
 
 def checks(rows, repaired: bool = True) -> dict:

@@ -14,10 +14,13 @@ import pytest
 
 from fitting.locate import where
 from fitting.report import rebuild, store
-from fitting.report.diagnosis_page import _shifts, _size, headline, interval, placebo_section, tone
+from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, headline, interval, placebo_section, tone
 from fitting.report.fit_page import diagnose_command, sentence, validity
 from fitting.report.plane import never_switched
+from fitting.report.residuals import repeating, strokes
+from fitting.report.style import plain
 from fitting.report.tables import interval as interval_of
+from fitting.report.tables import recordings as recordings_table
 from fitting.report.tables import to_error
 from fitting.screen import Candidate
 from magjax.errors import ConfigurationError
@@ -167,11 +170,14 @@ def test_the_banner_of_a_fit(folders):
     fit = json.loads((folders["fit"] / "fit.json").read_text())
     assert validity(fit)[3] == ""
     tone, said, advice, doubt = validity({**fit, "chi2_per_sample": 9.0})
-    assert tone == "bad" and "3 times the noise" in said and "diagnosis" in advice and doubt == "not valid"
+    assert tone == "bad" and "3 times its noise" in said and "diagnosis" in advice and doubt == "not valid"
     assert validity({**fit, "chi2_per_sample": float("nan")})[0] == "bad"
     assert validity({**fit, "converged": False})[0] == "bad"
     assert validity({**fit, "chi2_per_sample": 1.4})[0::3] == ("warn", "too narrow")
+    alone = [{**fit["recordings"][0], "file": "runs/rec_9.csv", "chi2_per_sample": 1.84}, *fit["recordings"][1:]]
+    assert "in rec_9.csv (χ²/N = 1.84)" in validity({**fit, "recordings": alone})[1]
     assert "assumed" in validity({**fit, "chi2_per_sample": 0.2})[1]
+    assert "<td>yes</td>" in good and "<td>yes (errors not valid)</td>" in bad and "is below 30 % (errors not valid)" in bad
     bound = {**fit["parameters"], "mechanics.xi": {**fit["parameters"]["mechanics.xi"], "at_bound": True}}
     assert "mechanics.xi" in validity({**fit, "parameters": bound})[1]
     loose = {**fit["parameters"], "mechanics.xi": {**fit["parameters"]["mechanics.xi"], "identified": False}}
@@ -183,7 +189,7 @@ def test_a_bad_fit_says_the_command_that_follows(folders, tmp_path):
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     page = rebuild(tmp_path).read_text(encoding="utf-8")
     assert "<code>magjax diagnose rec_*.csv --bench aa-050h --out result-diagnosis</code>" in page  # not over the fit
-    fit["message"] = "the residual is 3 times the noise; run magjax diagnose on the same files"
+    fit["message"] = "what repeats is 3 times its noise; run magjax diagnose on the same files"
     for reproduce, command in ((fit["reproduce"], True), ("magjax demo --seed 0", False)):
         (tmp_path / "fit.json").write_text(json.dumps({**fit, "reproduce": reproduce}))
         banner = Outline(rebuild(tmp_path).read_text(encoding="utf-8")).all("section")[0][2]
@@ -222,11 +228,19 @@ def test_a_silent_headline_says_what_is_left(diagnoses, folders, tmp_path):
     assert headline(good) == "Nothing is missing: the model meets the recordings to their noise" and tone(good) == "good"
     for wrong, said in (
         ({"base": {**good["base"], "chi2_per_sample": 1.31}}, "χ²/N = 1.31 is left"),
-        ({"base": {**good["base"], "recordings": [{"chi2_per_sample": 2.5}]}}, "one recording is left with a misfit of χ²/N = 2.5"),
+        (
+            {"base": {**good["base"], "recordings": [{"chi2_per_sample": 2.5, "file": "a/r1.csv"}]}},
+            "(17 of 20 could be judged); r1.csv is left with a misfit of χ²/N = 2.5",
+        ),
         ({"check": [{"rms_after": 1.32e-7, "noise_rms": 4.9e-8, "unit": "m"}]}, "missed by 132 nm (noise 49 nm)"),
     ):
-        bad = good | wrong
-        assert headline(bad).startswith("Nothing of the catalogue is missing; ") and said in headline(bad) and tone(bad) == "warn"
+        judged = [{"name": f"e{k}"} for k in range(20)]
+        bad = good | {"candidates": judged, "absorbed": ["e1", "e2", "e3", "zero_drift"]} | wrong
+        assert (
+            headline(bad).startswith("No effect of the catalogue was found (17 of 20 could be judged); ")
+            and said in headline(bad)
+            and tone(bad) == "warn"
+        )
     stored = json.loads((folders["nothing_missing"] / "diagnosis.json").read_text())
     stored["base"]["chi2_per_sample"] = 1.31
     (tmp_path / "diagnosis.json").write_text(json.dumps(stored))
@@ -366,6 +380,54 @@ def test_the_placebo_panel():
     assert placebo_section(None, "data_problem") is None
     low, high = interval(0, 20)
     assert low == 0 and high == pytest.approx(0.161, abs=2e-3)  # Wilson: z^2 / (n + z^2)
+
+
+def test_chi2_is_defined_and_a_diagnosis_does_not_ask_for_itself(folders, html, kind):
+    assert html.count("It is 1 where only noise is left") == (kind not in ("unsettled", "unreadable"))
+    if kind in ("fit", "poor"):
+        return
+    found = json.loads((folders[kind] / "diagnosis.json").read_text())
+    for fit in filter(None, (found["base"], found["repaired"])):
+        fit["message"] = "what repeats is 3.7 times its noise; run magjax diagnose on the same files"
+    text = json.dumps(diagnosis_page(found, store.load(folders[kind]))["sections"], default=str)
+    assert "same files" not in text and ("3.7 times its noise" in text) == (kind not in ("data_problem", "unsettled", "unreadable"))
+
+
+def test_what_repeats_stands_beside_what_a_sample_leaves(folders):
+    evidence = store.load(folders["fit"])
+    misfit, noise = repeating(evidence)
+    loop = evidence["loops"]["0"]  # the same from one period of the model less the mean of the periods, which holds its noise too
+    assert 0.3 * noise[0] < misfit[0] < np.sqrt(np.mean((loop["model"] - loop["measured"]) ** 2))
+    assert strokes(evidence)[0] == pytest.approx(np.ptp(loop["measured"]), rel=0.02)
+    older = {k: v for k, v in evidence.items() if k != "stroke"}
+    assert strokes(older)[0] == pytest.approx(np.ptp(loop["measured"]))
+    fit = json.loads((folders["fit"] / "fit.json").read_text())
+    row = dict(zip((made := recordings_table(fit, evidence))["head"], made["rows"][0], strict=True))
+    assert row["repeating misfit"] == f"{plain(1e9 * misfit[0])} nm" and row["its noise"] == f"{plain(1e9 * noise[0])} nm"
+    assert row["of the stroke"] == f"{plain(100 * misfit[0] / strokes(evidence)[0], 2)} %"
+    assert "repeating misfit" not in recordings_table(fit)["head"]  # where the evidence was lost
+
+
+def test_before_and_after_stand_in_one_table(folders):
+    page = (folders["attributed"] / "report.html").read_text(encoding="utf-8")
+    found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
+    table = page.split("Misfit of each recording, before and after</caption>")[1].split("</table>")[0]
+    ends = [plain(found[k]["recordings"][0]["chi2_per_sample"]) for k in ("base", "repaired")]
+    assert f"<td>{ends[0]}</td><td>{ends[1]}</td>" in table and table.count("<tr>") == 4
+    assert "Misfit of each recording, before" not in (folders["nothing_missing"] / "report.html").read_text(encoding="utf-8")
+    assert (
+        "noise of what repeats, in all harmonics" in page
+        and ">noise of what repeats</text>" in page
+        and ">noise of a sample</text>" in page
+    )
+
+
+def test_a_size_found_beside_a_misfit_is_doubted_like_the_later_table(diagnoses, folders):
+    found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
+    assert "size (± too narrow)" not in (folders["attributed"] / "report.html").read_text(encoding="utf-8")
+    found["repaired"]["chi2_per_sample"] = 1.4
+    page = json.dumps(diagnosis_page(found, {})["sections"], default=str, ensure_ascii=False)
+    assert "size (± too narrow)" in page and "std. error (too narrow)" in page
 
 
 def test_messages_read_as_sentences():
