@@ -153,6 +153,15 @@ class Evidence:
         return self.bench.drive == "current" and not measured
 
 
+def unusable(errors, sound=()) -> Diagnosis:
+    """The verdict over files that cannot be used, by their errors; `sound`: the recordings that can."""
+    text = " ".join(f"{error}." for error in errors)
+    if sound:
+        others = "The other recording" if len(sound) == 1 else f"The other {len(sound)} recordings"
+        text += f" {others} can be read and {'is' if len(sound) == 1 else 'are'} not clipped."
+    return Diagnosis("data_problem", text, data_problem=str(errors[0]))
+
+
 def misfit(rows, which: str) -> float:
     """Of check recordings above their noise: the sum of (rms / noise)^2 - 1. `which`: "rms_before" or "rms_after"."""
     return sum(max((r[which] / (r["noise_rms"] or r["rms_before"])) ** 2 - 1, 0.0) for r in rows)

@@ -22,6 +22,7 @@ TONES = {
 }
 RUN_PLACEBO = "To run it: add --placebo 20 to the command that made this folder."
 HERE = re.compile(r"; run magjax diagnose on the same files| \(magjax diagnose tells which\)")  # a fit's advice, followed here
+FILE = re.compile(r"(?:^|[.] )(\S+[.]\w+): ")  # that an error begins with
 FRAMED = (
     "The framed block need not be the darkest. The shades are of single effects of the catalogue, to first order; the frame stands where a "
     "smooth function that was fitted jointly with all else foretells recordings left out best, or, of those that foretell them about as well, "
@@ -46,7 +47,12 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         _groups(found, facts),
         _unknown(found, sketch),
         section("Next experiment", *_next(found, names)),
-        section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"))),
+        section("The signal at fault", sketch(evidence.get("offender"), loops.offender, evidence.get("offender"))),
+        section(
+            "The recordings as they are",
+            part(table=None if fit else tables.as_recorded(evidence.get("recordings"))),
+            sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings")),
+        ),
         _checks(found, evidence, sketch, output, drive),
         _where(found, facts, base, sketch, output, drive),
         _ranking(found, facts, sketch),
@@ -59,10 +65,13 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     ]
     count = len(fit.get("recordings", []))
     plural = lambda n, what: f"{n} {what}{'' if n == 1 else 's'}"
+    name = fit["bench"] if fit else str(evidence.get("bench", ""))
     about = (
-        f"Bench {fit['bench']}; {plural(count, 'recording')}, {plural(len(found['check']), 'check recording')}."
+        f"Bench {name}; {plural(count, 'recording')}, {plural(len(found['check']), 'check recording')}."
         if fit
-        else "No model could be fitted."
+        else f"Bench {name}; no fit was tried."
+        if name
+        else "No fit was tried."
     )
     said = (
         "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file."
@@ -70,7 +79,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         else ""
     )
     return {
-        "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else tone(found),
+        "title": f"Diagnosis of {name}" if name else "Diagnosis", "facts": about, "tone": "bad" if broken else tone(found),
         "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
         "message": [said or sentence(spoken(found["message"], names))], "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
     }  # fmt: skip
@@ -131,8 +140,18 @@ def headline(found) -> str:
     return {
         "nothing_missing": "Nothing is missing: the model meets the recordings to their noise",
         "absorbed": "What may be missing cannot show in these recordings: the density absorbs it",
-        "data_problem": "The recordings or the bench file must be mended first; no physics is judged",
+        "data_problem": f"{_at_fault(found)} must be mended first; no physics is judged",
     }.get(verdict, words(verdict))
+
+
+def _at_fault(found) -> str:
+    """What a data problem asks to be mended."""
+    text = f"{found['message']} {found['data_problem'] or ''}"
+    bench = "[columns" in text or "bench file" in text
+    files = list(dict.fromkeys(Path(name).name for name in FILE.findall(text)))
+    if bench and (files or "leave it out" in text):
+        return "The recordings or the bench file"
+    return "The bench file" if bench else " and ".join(files) or "The recordings"
 
 
 def _judged(found) -> str:

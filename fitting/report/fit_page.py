@@ -13,6 +13,7 @@ DEFINED = (
     "left; its root says how many times its noise the misfit is that repeats every period."
 )
 NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
+MICROMETRES = re.compile(r"(\d[\d.]*e-0[45]) m\b")
 BELOW_NOISE, AT_NOISE, FAR = 0.5, 1.1, 2.0  # chi2/N: noise overstated; the error bars hold; they mean nothing
 WORST_AT_NOISE = 1.6
 WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|[^\s'"])+""")  # of a command line
@@ -66,6 +67,7 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
         section(
             "Measured and fitted",
             part(heading="Check recordings", table=tables.checks(fit["check"], repaired=False)) if fit.get("check") else None,
+            sketch(evidence.get("checks"), loops.checks, evidence.get("checks"), output, drive, fit.get("check"), False),
             *headed("Loops", sketch(evidence, loops.loops, evidence, output, drive)),
             *headed("Zoom in time", sketch(evidence, loops.zoom, evidence, output)),
         ),
@@ -147,6 +149,7 @@ def sentence(text: str) -> str:
     if not text:
         return ""
     text = NANOMETRES.sub(lambda m: " → ".join(f"{1e9 * float(v):.3g}" for v in m.groups() if v) + " nm", text)
+    text = MICROMETRES.sub(lambda m: f"{1e6 * float(m[1]):.4g} µm", text)
     first = text.split()[0].rstrip(",:;.")
     return (text[0].upper() + text[1:] if first.isalpha() else text) + ("" if text.endswith((".", "?", "!")) else ".")
 

@@ -10,6 +10,7 @@ from .style import (
     MEASURED,
     MODEL,
     MUTED,
+    ORANGE,
     PALE,
     SKY,
     VERMILION,
@@ -20,6 +21,7 @@ from .style import (
     plain,
     scale_of,
     styled,
+    unit_text,
 )
 
 COLUMNS = 3
@@ -241,6 +243,33 @@ def _inside_row(axes, row, signals, terms, first):
     if row != "loop":
         axes.set_xlim(0, 1)
     axes.locator_params(axis="y", nbins=4)
+
+
+def offender(entry, stem: str = "offender"):
+    """The signal of a file that cannot be used: the whole of it, and about the place where it is at fault."""
+    channel, timed = str(entry["channel"]), bool(entry["timed"])
+    known = channel in ("displacement", "flux_density", "magnetization", "polarization")
+    factor, label = (
+        scale_of(channel)[:2] if known else (1.0, f"{channel.replace('_', ' ')} / {per(unit_text(str(entry['unit'])) or '1')}")
+    )
+    first, last = (1e3 if timed else 1.0) * np.asarray(entry["span"])
+    with styled():
+        figure = canvas(WIDTH, 2.6)
+        for k, (key, title) in enumerate((("whole", f"{entry['name']}, as recorded"), ("near", "about the place"))):
+            axes = figure.add_axes([0.07 + 0.49 * k, 0.2, 0.42, 0.68])
+            axes.axvspan(first, last, color=ORANGE, alpha=0.35, lw=0, label="here")
+            at = (1e3 if timed else 1.0) * entry[key]["time"]
+            axes.plot(at, factor * entry[key]["values"], color=BLUE, lw=1.0, marker="." if k else "", ms=2.5, mew=0)
+            axes.set(title=title, xlabel="time / ms" if timed else "sample", xlim=(at[0], at[-1]))
+            if k == 0:
+                axes.set_ylabel(label)
+                axes.legend(loc="best")
+        caption = (
+            "The signal for which the file cannot be used, as it was recorded, and the samples about the place, which is marked."
+        )
+        return picture(
+            figure, stem, "The signal at fault", caption, f"From {plain(first)} to {plain(last)} {'ms' if timed else 'samples'}."
+        )
 
 
 def periods(entries, stem: str = "periods"):

@@ -3,6 +3,8 @@
 import math
 from pathlib import Path
 
+import numpy as np
+
 from ..reach import beyond_text
 from .residuals import repeating, strokes
 from .style import plain, scale_of, unit_text
@@ -126,6 +128,20 @@ def recordings(fit, evidence=None) -> dict:
     if not any(row[-1] for row in rows):  # recordings that were never files
         head, rows = head[:-1], [row[:-1] for row in rows]
     return table("Noise and misfit of each recording", head, rows, note, code=True)
+
+
+def as_recorded(entries) -> dict | None:
+    """What can be said of recordings that no fit has seen; `entries`: as `evidence.of_recordings` keeps them."""
+    rows = []
+    for e in (entries or {}).values():
+        factor, unit = (1e6, "µm") if str(e["output"]) == "displacement" else scale_of(str(e["output"]))[2:]
+        frequency = f"{plain(float(e['frequency']), 4)} Hz" if e["frequency"] else "does not repeat"
+        rows.append([str(e["name"]), frequency, int(max(e["number"])), f"{plain(factor * float(np.ptp(e['reading'])))} {unit}"])
+    return (
+        table("Recordings that can be read", ["recording", "frequency", "periods", "peak to peak"], rows, code=True)
+        if rows
+        else None
+    )
 
 
 def percent_of(part: float, whole: float) -> str:

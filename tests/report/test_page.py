@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fitting.locate import where
-from fitting.report import rebuild, store
+from fitting.report import rebuild, store, write_diagnosis
 from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, headline, interval, placebo_section, tone
 from fitting.report.fit_page import diagnose_command, sentence, validity
 from fitting.report.plane import never_switched
@@ -24,6 +24,7 @@ from fitting.report.tables import recordings as recordings_table
 from fitting.report.tables import to_error
 from fitting.screen import Candidate
 from magjax.errors import ConfigurationError
+from magjax.readers import load_sound
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 
@@ -216,7 +217,7 @@ def test_the_verdict_comes_first_and_in_plain_words(folders, diagnoses):
     for kind, found in diagnoses.items():
         page = Outline((folders[kind] / "report.html").read_text(encoding="utf-8"))
         first = next(e for e in page.elements if e[1].get("class") == "head")
-        assert first[2] == headline(found.as_dict()) and "_" not in first[2]
+        assert first[2] == headline(found.as_dict()) and "_" not in re.sub(r"\S+[.]csv", "", first[2])
     assert "amplifier lag" in headline(diagnoses["attributed"].as_dict())
     assert "cannot say which" in headline(diagnoses["group"].as_dict())
     assert "sensor" in headline(diagnoses["unknown_at"].as_dict())
@@ -367,6 +368,56 @@ def test_a_misfit_that_is_no_number_is_never_a_verdict(folders, tmp_path):
     (tmp_path / "diagnosis.json").write_text(json.dumps(found))
     page = rebuild(tmp_path).read_text(encoding="utf-8")
     assert 'class="banner bad"' in page and "broke down" in page and "Nothing is missing" not in page
+
+
+def test_a_file_that_cannot_be_used_is_shown_and_the_others_are_told(tmp_path, runs, bench):
+    from fitting.verdict import unusable
+
+    paths = [tmp_path / f"rec_{k}.csv" for k in range(3)]
+    for k, (path, run) in enumerate(zip(paths, runs[0], strict=True)):
+        y = run.channels["displacement"]
+        y = np.minimum(y, np.quantile(y, 0.8)) if k < 2 else y
+        rows = np.stack([np.arange(len(y)) * run.dt, run.channels["current"], y], 1)
+        np.savetxt(path, rows, delimiter=",", header="time_s,current_A,displacement_m", comments="")
+    sound, errors = load_sound(paths, bench)
+    assert [r.name for r in sound] == ["rec_2.csv"] and len(errors) == 2
+    found = unusable(errors, sound)
+    assert found.message.endswith("The other recording can be read and is not clipped.") and found.data_problem == str(errors[0])
+    write_diagnosis(tmp_path, found, sound, found.as_dict(), "magjax diagnose", bench=bench, shown=errors[0].shown)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert (
+        "rec_0.csv and rec_1.csv must be mended first" in page and "Bench aa-050h; no fit was tried." in page and " µm for " in page
+    )
+    assert page.count("<svg") == 2 and "The signal at fault" in page
+    table = page.split("Recordings that can be read</caption>")[1].split("</table>")[0]
+    assert ">rec_2.csv<" in table and "<td>250 Hz</td>" in table and "rec_0" not in table
+    marked = store.load(tmp_path)["offender"]
+    first, length = errors[0].shown["first"], errors[0].shown["length"]
+    assert marked["span"] == pytest.approx(np.array([first, first + length - 1]) * runs[0][0].dt, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("problem", "fault"),
+    [
+        ("r.csv: the reading drifts by 3 through the record; let it warm up", "r.csv"),
+        ("the periods do not repeat: in most recordings the last differs", "The recordings"),
+        (
+            "the reading falls where the drive rises: the sign of a channel is swapped; set scale = -1 in [columns]",
+            "The bench file",
+        ),
+        ("r.csv: no time column among a, b; name one time_s or map it in [columns.time]", "The recordings or the bench file"),
+    ],
+)
+def test_a_data_problem_says_what_is_at_fault(problem, fault):
+    found = {"verdict": "data_problem", "message": f"{problem}.", "data_problem": problem}
+    assert headline(found) == f"{fault} must be mended first; no physics is judged"
+
+
+def test_check_recordings_of_a_fit_are_drawn(folders):
+    page = (folders["fit"] / "report.html").read_text(encoding="utf-8")
+    assert page.count("check_150Hz.csv") >= 2 and 'aria-label="Check recordings"' in page
+    drawn = page.split('aria-label="Check recordings"')[1].split("</svg>")[0]
+    assert ">fitted</text>" in drawn and ">before</text>" not in drawn and "before and after" not in page
 
 
 def test_the_placebo_panel():
