@@ -10,7 +10,7 @@ from . import learned, loops, misfit, plane, tables
 from .fit_page import AT_NOISE, DEFINED, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
 from .residuals import repeating
-from .style import percent, plain, scale_of, terms_in, unit_text
+from .style import percent, plain, scale_of, terms_in, unit_text, words
 
 TONES = {
     "nothing_missing": "good",
@@ -54,7 +54,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
             sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings")),
         ),
         _checks(found, evidence, sketch, output, drive),
-        _where(found, facts, base, sketch, output, drive),
+        _where(found, facts, base, repaired, sketch, output, drive),
         _ranking(found, facts, sketch),
         _loops(found, base, repaired, sketch, output, drive),
         _left(found, base, repaired, sketch, output),
@@ -83,11 +83,6 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
         "message": [said or sentence(spoken(found["message"], names))], "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
     }  # fmt: skip
-
-
-def words(name: str) -> str:
-    """An effect's name as people say it."""
-    return name.replace("_", " ")
 
 
 def spoken(text: str, names) -> str:
@@ -291,7 +286,7 @@ def _loops(found, base, repaired, sketch, output, drive):
     )
 
 
-def _where(found, facts, base, sketch, output, drive):
+def _where(found, facts, base, repaired, sketch, output, drive):
     where = found["where"]
     if not where or not base:
         return None
@@ -302,7 +297,9 @@ def _where(found, facts, base, sketch, output, drive):
         "Where simulation and recordings differ",
         part(text=FRAMED if "function" in (found["unknown"] or {}) else ""),
         sketch(where.get("by_block"), pictures.block_map, where, marks, drive),
-        *headed("Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base)),
+        *headed(
+            "Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base, beside=repaired)
+        ),
         *headed(
             f"By branch, {terms_in(base).field} and period", sketch(where.get("by_branch"), pictures.places, where, base, output)
         ),
@@ -394,7 +391,7 @@ def _left(found, base, repaired, sketch, output):
         f"What {repair_words(found)} leaves",
         *headed(
             "By frequency and harmonic",
-            sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise"),
+            sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise", base),
         ),
         *headed(
             f"Against {terms_in(repaired).field}, rate and frequency", sketch(repaired, misfit.against, repaired, "against-after")

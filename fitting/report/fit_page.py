@@ -16,6 +16,7 @@ NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
 MICROMETRES = re.compile(r"(\d[\d.]*e-0[45]) m\b")
 BELOW_NOISE, AT_NOISE, FAR = 0.5, 1.1, 2.0  # chi2/N: noise overstated; the error bars hold; they mean nothing
 WORST_AT_NOISE = 1.6
+FEWEST_STEPS = 3  # that make a picture of how the fit went
 WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|[^\s'"])+""")  # of a command line
 FIT_ALONE = ("--cells", "--bootstrap", "--bootstrap-kind", "--profile", "--workers", "--scheduler", "--checkpoint")
 
@@ -140,11 +141,12 @@ def headed(heading, drawn) -> list:
 def convergence_part(sketch, fit):
     """How the objective fell, where the fit kept it."""
     steps = [s for s in fit.get("history", []) if s[2] is not None and s[2] > 0]
-    return sketch(steps, misfit.convergence, steps)
+    return sketch(steps if len(steps) >= FEWEST_STEPS else None, misfit.convergence, steps)
 
 
 def sentence(text: str) -> str:
     """A message with a capital (unless it begins with a name) and a full stop, its signs as people write them."""
+    text = re.sub(r"(?<=\d)%", "\u00a0%", text)
     text = text.strip().replace(" -> ", " → ").replace("chi2/N", "χ²/N").replace("= nan", "= not a number")
     if not text:
         return ""

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .residuals import repeating
-from .style import BLUE, INK, MUTED, PALE, SKY, VERMILION, canvas, percent, picture, plain, scale_of, styled
+from .style import BLUE, INK, MUTED, PALE, SKY, VERMILION, canvas, percent, picture, plain, scale_of, styled, words
 
 WIDTH = 10.0
 BLOCKS = ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sensor")
@@ -117,12 +117,12 @@ def ranking(candidates, stem: str = "ranking", count: int = 16):
                     va="center",
                     fontsize=7.5,
                 )
-        axes.set_yticks(range(len(rows)), [c["name"].replace("_", " ") for c in rows])
+        axes.set_yticks(range(len(rows)), [words(c["name"]) for c in rows])
         axes.set_ylim(-0.6, len(rows) - 0.4)
         axes.set_xlabel("score |z|, standard deviations")
         caption = (
             "Score of each effect on what the plain model leaves, off everything that the plain model can do itself (root scale). Dashed: the "
             f"threshold of {THRESHOLD}. Dark: fitted for real, with the fall of χ² that it achieved."
         )
-        lead = "; ".join(f"{c['name']} {plain(abs(c['z']))}" for c in candidates[:5])
+        lead = "; ".join(f"{words(c['name'])} {plain(abs(c['z']))}" for c in candidates[:5])
         return picture(figure, stem, "Ranking of the catalogue", caption, f"Leaders: {lead}.")

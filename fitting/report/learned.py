@@ -4,11 +4,11 @@ import numpy as np
 
 from . import tables
 from .page import part
-from .style import BLUE, GREEN, MUTED, PALE, VERMILION, canvas, percent, picture, plain, styled, unit_text
+from .style import BLUE, MUTED, PALE, canvas, per, percent, picture, plain, styled, unit_text
 
 SHOWN = 8  # boundaries of the table, and any further one that was fitted
 FITTED = ("fitted jointly: χ²/N", "left out: χ²/N")
-FINE = {"m": (1e9, "nm"), "A/m": (1.0, "A/m"), "A": (1e3, "mA"), "T": (1e3, "mT")}
+UNITS = {"m": (1e6, "µm"), "m/s": (1e3, "mm/s"), "A/m": (1e-3, "kA/m"), "A": (1.0, "A"), "T": (1e3, "mT")}
 
 
 def parts(unknown, sketch) -> list:
@@ -39,8 +39,13 @@ def _joined(variables):
     return " and ".join(variables).replace(" and times_", ", times ").replace("_", " ")
 
 
+def in_units(unit: str) -> tuple[float, str]:
+    """(factor, unit) in which a quantity of the learned function is shown, the same in its table and its picture."""
+    return UNITS.get(unit, (1.0, unit_text(unit) or "1"))
+
+
 def _with_unit(value, unit):
-    factor, label = FINE.get(unit, (1.0, unit))
+    factor, label = in_units(unit)
     return f"{plain(factor * value)} {label}"
 
 
@@ -79,44 +84,42 @@ def _boundaries(unknown):
 
 
 def learned_function(unknown, stem: str = "learned"):
-    """The function with its 95 % band over its first variable; the range seen is white, beyond it grey."""
+    """The function with its 95 % band over its first variable, a panel for each value of the second; the range seen is white,
+    beyond it grey."""
     x = np.asarray(unknown["function"]["x"])
-    unit = unknown["variable_units"][0]
-    fine = {"m": (1e6, "µm"), "m/s": (1e3, "mm/s"), "A/m": (1e-3, "kA/m")}
-    factor, label = fine.get(unit, (1.0, unit_text(unit) or "1"))
-    scale, output = FINE.get(unknown["unit"], (1.0, unknown["unit"]))
+    factor, label = in_units(unknown["variable_units"][0])
+    scale, output = in_units(unknown["unit"])
+    slices = unknown["function"]["slices"]
     seen = [factor * v for v in unknown["seen"][0]]
-    second = unknown["variables"][1].replace("_", " ") if len(unknown["variables"]) > 1 else ""
     inside = (x >= unknown["seen"][0][0]) & (x <= unknown["seen"][0][1])
-    ends = [
-        scale * f([f(np.asarray(s[k])[inside]) for s in unknown["function"]["slices"]])
-        for k, f in (("low", np.min), ("high", np.max))
-    ]
-    room = 0.6 * (ends[1] - ends[0])
+    ends = [scale * f([f(np.asarray(s[k])[inside]) for s in slices]) for k, f in (("low", np.min), ("high", np.max))]
+    room = 0.25 * (ends[1] - ends[0])
     with styled():
         figure = canvas(10.0, 2.8)
-        axes = figure.add_axes([0.085, 0.19, 0.86, 0.76])
-        for s, colour, dash in zip(
-            unknown["function"]["slices"], (BLUE, VERMILION, GREEN), ("-", (0, (5, 2)), (0, (1, 1))), strict=False
-        ):
-            name = "learned" if s["at"] is None else f"{second} {plain(s['at'])} {unit_text(unknown['variable_units'][1])}"
-            axes.fill_between(
-                factor * x, scale * np.asarray(s["low"]), scale * np.asarray(s["high"]), color=colour, alpha=0.18, lw=0
-            )
-            axes.plot(factor * x, scale * np.asarray(s["value"]), color=colour, ls=dash, label=name)
-        for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
-            axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
-        axes.axhline(0, color=MUTED, lw=0.5)
-        axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room))
-        axes.set(
-            xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}"
-        )
-        if len(unknown["function"]["slices"]) > 1:
-            axes.legend(loc="best")
+        for k, s in enumerate(slices):
+            axes = figure.add_axes([0.075 + k * 0.92 / len(slices), 0.19, 0.92 / len(slices) - 0.045, 0.68])
+            axes.fill_between(factor * x, scale * np.asarray(s["low"]), scale * np.asarray(s["high"]), color=BLUE, alpha=0.18, lw=0)
+            axes.plot(factor * x, scale * np.asarray(s["value"]), color=BLUE)
+            for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
+                axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
+            axes.axhline(0, color=MUTED, lw=0.5)
+            axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room))
+            axes.set(xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {per(label)}", title=_slice(unknown, s))
+            if k == 0:
+                axes.set_ylabel(f"added at the {unknown['block']} / {per(output)}")
         caption = (
             f"Learned function: what the {unknown['block']} adds beside the model, with its 95 % interval, less its mean. Grey: beyond what the recordings "
             "reached, where it is held and its interval widens."
         )
-        middle = unknown["function"]["slices"][0]
+        middle = slices[0]
         words = f"From {plain(scale * middle['value'][0])} to {plain(scale * middle['value'][-1])} {output}."
         return picture(figure, stem, "Learned function", caption, words)
+
+
+def _slice(unknown, s) -> str:
+    """Where in the second variable a panel lies, "" where there is no second."""
+    if s["at"] is None:
+        return ""
+    factor, label = in_units(unknown["variable_units"][1])
+    name = unknown["variables"][1].removeprefix("times_").replace("_", " ")
+    return f"{name} {plain(factor * s['at'])} {label}"

@@ -131,17 +131,21 @@ def _loop(axes, loop, drive_factor, factor, heading):
         axes.plot(close(drive), factor * close(loop["after"]), color=INK, lw=0.8, label="after")
     axes.set_title(heading, loc="left", linespacing=1.3)
     axes.margins(0.04)
+    axes.locator_params(axis="x", nbins=5)
+    axes.locator_params(axis="y", nbins=6)
 
 
 def _strip(axes, loop, strips, fine):
-    phase, band = loop["phase"], 2 * fine * loop["noise"]
-    axes.fill_between(phase, -band, band, color=PALE, lw=0, label="twice the noise")
+    phase = loop["phase"]
+    band = 2 * fine * float(np.median(loop["noise"]))  # bins that do not divide the period hold one sample more or less
+    axes.axhspan(-band, band, color=PALE, lw=0, label="twice the noise")
     axes.axhline(0, color=MUTED, lw=0.5)
-    styles = {"model": {"color": MODEL, "lw": 0.9}, "after": {"color": INK, "lw": 0.9}}
+    below = {"lw": 2.6, "alpha": 0.45} if len(strips) > 1 else {"lw": 0.9}  # seen under the other
+    styles = {"model": {"color": MODEL, **below}, "after": {"color": INK, "lw": 0.8}}
     for key, _, values in strips:
         axes.plot(phase, fine * values, **styles[key])
     reach = max(np.max(np.abs(fine * values)) for _, _, values in strips)
-    reach = max(1.1 * reach, 1.6 * float(np.max(band)))
+    reach = max(1.1 * reach, 1.6 * band)
     axes.set(xlim=(0, 1), ylim=(-reach, reach))
     axes.locator_params(axis="y", nbins=3)
 
@@ -184,7 +188,7 @@ def zoom(evidence, output: str, stem: str = "zoom"):
 
 def inside(evidence, drive: str, stem: str = "inside"):
     """H, I_1 and M over a period, and M against H, of a few recordings."""
-    keys = list(evidence["inside"])
+    keys = sorted(evidence["inside"], key=lambda k: evidence["frequency"][int(k)])
     with_current = "I_1" in evidence["inside"][keys[0]]
     terms = terms_of(drive)
     rows = ["H", "I_1", "M", "loop"] if with_current else ["M", "loop"] if drive == "voltage" else ["H", "M", "loop"]

@@ -16,6 +16,8 @@ from fitting.locate import where
 from fitting.report import rebuild, store, write_diagnosis
 from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, headline, interval, placebo_section, tone
 from fitting.report.fit_page import diagnose_command, sentence, validity
+from fitting.report.learned import learned_function
+from fitting.report.loops import inside, loops
 from fitting.report.plane import never_switched
 from fitting.report.residuals import repeating, strokes
 from fitting.report.style import plain
@@ -418,6 +420,42 @@ def test_check_recordings_of_a_fit_are_drawn(folders):
     assert page.count("check_150Hz.csv") >= 2 and 'aria-label="Check recordings"' in page
     drawn = page.split('aria-label="Check recordings"')[1].split("</svg>")[0]
     assert ">fitted</text>" in drawn and ">before</text>" not in drawn and "before and after" not in page
+
+
+def test_a_learned_function_has_a_panel_for_each_value_of_its_second_variable():
+    line = {"value": [0.0, 2e-7], "low": [-1e-7, 1e-7], "high": [1e-7, 3e-7]}
+    unknown = {
+        "block": "magnetostriction", "variables": ["magnetization", "field"], "variable_units": ["A/m", "A/m"], "unit": "m", "seen": [[1e5, 5e5]],
+        "function": {"x": [1e5, 5e5], "slices": [{"at": a, **line} for a in (5230.0, 13800.0)]},
+    }  # fmt: skip
+    svg = learned_function(unknown).svg
+    assert (
+        ">field 5.23 kA/m</text>" in svg
+        and ">field 13.8 kA/m</text>" in svg
+        and ">added at the magnetostriction / µm</text>" in svg
+    )
+    assert svg.count(">magnetization / (kA/m)</text>") == 2
+
+
+def test_what_says_nothing_is_not_drawn_and_columns_go_by_frequency(folders, tmp_path):
+    fit = json.loads((folders["fit"] / "fit.json").read_text())
+    assert 'aria-label="Convergence"' in (folders["fit"] / "report.html").read_text(encoding="utf-8")
+    shutil.copy(folders["fit"] / "report.npz", tmp_path)
+    (tmp_path / "fit.json").write_text(json.dumps(fit | {"history": fit["history"][:2]}))
+    assert 'aria-label="Convergence"' not in rebuild(tmp_path).read_text(encoding="utf-8")
+    evidence = store.load(tmp_path)
+    evidence["inside"] = dict(reversed(evidence["inside"].items()))
+    titles = re.findall(r">rec[^<]*, (\d+) Hz</text>", inside(evidence, "current").svg)
+    assert len(titles) == 3 and titles == sorted(titles, key=int)
+
+
+def test_the_band_of_a_strip_has_no_teeth(folders):
+    evidence = store.load(folders["fit"])
+    (loop,) = (evidence["loops"][k] for k in ("0",))
+    loop["noise"] = np.where(np.arange(len(loop["noise"])) % 2, 1.0, 1.4) * loop["noise"]
+    smooth = {**loop, "noise": np.full_like(loop["noise"], np.median(loop["noise"]))}
+    drawn = [loops({**evidence, "loops": {"0": one}, "chosen": [0]}, "displacement", "current").svg for one in (loop, smooth)]
+    assert drawn[0] == drawn[1]
 
 
 def test_the_placebo_panel():
