@@ -54,6 +54,8 @@ def _boundaries(unknown):
     rows = []
     kept = (unknown["block"], tuple(unknown["variables"]))
     told = any("left_out" in b for b in unknown["boundaries"])  # a folder of before does not say which were tried
+    columns = [tables.aligned([[b.get(key)] for b in unknown["boundaries"]]) for key in ("chi2_per_sample", "left_out")]
+    fits = [[*a, *b] for a, b in zip(*columns, strict=True)]
     for rank, b in enumerate(unknown["boundaries"]):
         place, tried = (b["block"], tuple(b["variables"])), b.get("left_out") is not None
         if rank >= SHOWN and not tried and place != kept:
@@ -69,7 +71,7 @@ def _boundaries(unknown):
             if told
             else ""
         )
-        worth = [plain(b["chi2_per_sample"]), plain(b["left_out"])] if told else []
+        worth = fits[rank] if told else []
         rows.append(
             [b["block"], _joined(b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"]), *worth, said]
         )

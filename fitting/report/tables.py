@@ -1,6 +1,7 @@
 """The tables of the reports: numbers to the digits that their errors allow, flags in words."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,35 @@ CHANNEL_OF = {"m": "displacement", "T": "flux_density", "A/m": "magnetization", 
 
 
 def table(caption, head, rows, note: str = "", code: bool = False) -> dict:
-    """A table for the template: the first cell of each row is its header, set as code where it is a name to type."""
-    return {"caption": caption, "head": list(head), "rows": [[str(c) for c in row] for row in rows], "note": note, "code": code}
+    """A table for the template: the first cell of each row is its header, set as code where it is a name to type; columns of
+    numbers are set to the right."""
+    rows = [[str(c) for c in row] for row in rows]
+    right = [k > 0 and name != "answer" and _of_numbers([row[k] for row in rows]) for k, name in enumerate(head)]
+    return {"caption": caption, "head": list(head), "rows": rows, "right": right, "note": note, "code": code}
+
+
+NUMBER = re.compile(r"(?:[<>+−] ?)?(?:\d[\d.]*(?:e−?\d+)?|∞)(?: [^\d→]{1,12}| 1/\w+)?|–|not fitted")
+NUMBERS = 0.6  # share of the cells that makes a column one of numbers
+
+
+def _of_numbers(cells) -> bool:
+    """Whether a column holds numbers, units with them."""
+    filled = [c for c in cells if c]
+    return bool(filled) and sum(bool(NUMBER.fullmatch(c)) for c in filled) >= NUMBERS * len(filled)
+
+
+def aligned(rows, least: int = 0) -> list[list[str]]:
+    """Numbers that stand beside each other to the same decimals, three digits of the largest, `least` at least; each as it is
+    where they differ by far."""
+    sizes = [abs(v) for row in rows for v in row if v is not None and math.isfinite(v) and v != 0]
+    if not sizes or not 1e-3 <= max(sizes) < 1e5 or max(sizes) > FAR_APART * min(sizes):
+        return [[plain(v) for v in row] for row in rows]
+    decimals = max(least, 2 - math.floor(math.log10(max(sizes))))
+    write = lambda v: "–" if v is None or not math.isfinite(v) else f"{v:.{decimals}f}".replace("-", "−")
+    return [[write(v) for v in row] for row in rows]
+
+
+FAR_APART = 1e3
 
 
 def to_error(value: float, error: float) -> str:
@@ -117,11 +145,18 @@ def recordings(fit, evidence=None) -> dict:
     rows = []
     known = bool(evidence) and len(evidence["name"]) == len(fit["recordings"])
     repeats = list(zip(*repeating(evidence), strokes(evidence), strict=True)) if known else []
+    units = [scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:] for r in fit["recordings"]]
+    samples = aligned(
+        [[fine * r[k] for k in ("noise_rms", "residual_rms")] for r, (fine, _) in zip(fit["recordings"], units, strict=True)]
+    )
+    sizes = aligned([[fine * v for v in row[:2]] for row, (fine, _) in zip(repeats, units, strict=False)])
+    shares = aligned([[100 * misfit / stroke if stroke > 0 else None] for misfit, _, stroke in repeats])
+    chi2 = aligned([[r["chi2_per_sample"]] for r in fit["recordings"]], least=2)
     for k, r in enumerate(fit["recordings"]):
-        fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
-        more = [f"{plain(fine * v)} {unit}" for v in repeats[k][:2]] + [percent_of(*repeats[k][::2])] if known else []
-        rows.append([Path(r["file"]).name, plain(r["frequency"], 4), r["periods"], f"{plain(fine * r['noise_rms'])} {unit}",
-                     f"{plain(fine * r['residual_rms'])} {unit}", *more, plain(r["chi2_per_sample"]), r["sha256"][:12]])  # fmt: skip
+        unit = units[k][1]
+        more = [*(f"{v} {unit}" for v in sizes[k]), _with_percent(shares[k][0])] if known else []
+        rows.append([Path(r["file"]).name, plain(r["frequency"], 4), r["periods"], *(f"{v} {unit}" for v in samples[k]), *more, *chi2[k],
+                     r["sha256"][:12]])  # fmt: skip
     more = ["repeating misfit", "its noise", "of the stroke"] if known else []
     head = ["recording", "frequency / Hz", "periods", "noise of a sample", "residual of a sample", *more, "χ²/N", "sha256 begins"]
     note = REPEATING if known else ""
@@ -144,9 +179,8 @@ def as_recorded(entries) -> dict | None:
     )
 
 
-def percent_of(part: float, whole: float) -> str:
-    """A small part of a whole in percent, to two digits."""
-    return f"{plain(100 * part / whole, 2)} %" if whole > 0 else "–"
+def _with_percent(number: str) -> str:
+    return number if number == "–" else f"{number} %"
 
 
 def before_and_after(base, repaired, found) -> dict | None:
@@ -155,13 +189,13 @@ def before_and_after(base, repaired, found) -> dict | None:
     if not pairs or [Path(a["file"]).name for a, _ in pairs] != [Path(b["file"]).name for _, b in pairs]:
         return None
     known = all(len(e.get("name", ())) == len(pairs) for e in found)
-    repeats = [repeating(e)[0] for e in found] if known else []
+    fine, unit = scale_of(CHANNEL_OF.get(base["recordings"][0]["unit"], "displacement"))[2:]
+    samples = aligned([[fine * a["noise_rms"], fine * a["residual_rms"], fine * b["residual_rms"]] for a, b in pairs])
+    repeats = aligned((fine * np.stack([repeating(e)[0] for e in found], axis=1)).tolist()) if known else [[]] * len(pairs)
+    chi2 = aligned([[r["chi2_per_sample"] for r in pair] for pair in pairs], least=2)
     rows = []
-    for k, (a, b) in enumerate(pairs):
-        fine, unit = scale_of(CHANNEL_OF.get(a["unit"], "displacement"))[2:]
-        more = [f"{plain(fine * row[k])} {unit}" for row in repeats] if known else []
-        rows.append([Path(a["file"]).name, f"{plain(fine * a['noise_rms'])} {unit}", *(f"{plain(fine * r['residual_rms'])} {unit}" for r in (a, b)),
-                     *more, *(plain(r["chi2_per_sample"]) for r in (a, b))])  # fmt: skip
+    for (a, _), sample, repeat, worth in zip(pairs, samples, repeats, chi2, strict=True):
+        rows.append([Path(a["file"]).name, *(f"{v} {unit}" for v in (*sample, *repeat)), *worth])
     more = ["repeating misfit before", "after"] if known else []
     head = ["recording", "noise of a sample", "residual of a sample before", "after", *more, "χ²/N before", "after"]
     return table("Misfit of each recording, before and after", head, rows, REPEATING if known else "", code=True)
@@ -169,23 +203,16 @@ def before_and_after(base, repaired, found) -> dict | None:
 
 def checks(rows, repaired: bool = True) -> dict:
     """Prediction errors on recordings that took no part."""
-    body = []
+    keys, units, numbers = ("rms_before", "rms_after") if repaired else ("rms_after",), [], []
     for r in rows:
         fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
-        keys = ("rms_before", "rms_after") if repaired else ("rms_after",)
         beyond = [(max(r[k] ** 2 - r["noise_rms"] ** 2, 0.0)) ** 0.5 for k in keys]
-        body.append(
-            [
-                Path(r["file"]).name,
-                *(plain(fine * r[k]) for k in keys),
-                plain(fine * r["noise_rms"]),
-                *(plain(fine * b) for b in beyond),
-                unit,
-            ]
-        )
+        numbers.append([fine * v for v in (*(r[k] for k in keys), r["noise_rms"], *beyond)])
+        units.append(unit)
+    body = [[Path(r["file"]).name, *texts, unit] for r, texts, unit in zip(rows, aligned(numbers), units, strict=True)]
     when = (" before", " after") if repaired else ("",)
     head = ["recording", *(f"rms error{w}" for w in when), "noise rms", *(f"beyond noise{w}" for w in when), "unit"]
-    note = f"Beyond noise: the root of what the squared error exceeds the squared noise by. {beyond_text(rows)}".strip()
+    note = f"Beyond noise: √(rms error² − noise rms²), 0 where the error is the smaller. {beyond_text(rows)}".strip()
     return table("Errors of prediction", head, body, note, code=True)
 
 

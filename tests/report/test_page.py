@@ -18,9 +18,9 @@ from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, headli
 from fitting.report.fit_page import diagnose_command, sentence, validity
 from fitting.report.learned import learned_function
 from fitting.report.loops import inside, loops
+from fitting.report.page import kept_together
 from fitting.report.plane import never_switched
 from fitting.report.residuals import repeating, strokes
-from fitting.report.style import plain
 from fitting.report.tables import interval as interval_of
 from fitting.report.tables import recordings as recordings_table
 from fitting.report.tables import to_error
@@ -304,7 +304,10 @@ def test_each_rival_says_why_it_is_not_told_from_the_best(folders, tmp_path):
     found["ties"] = {n: {"chi2_per_sample": 1.03 + k, "why": why} for k, (n, why) in enumerate(zip(names, whys, strict=True))}
     (tmp_path / "diagnosis.json").write_text(json.dumps(found))
     page = rebuild(tmp_path).read_text(encoding="utf-8")
-    for said in ("<td>1.03</td><td>the best</td>", "<td>2.03</td><td>it meets the noise too, 30 in χ² behind</td>"):
+    for said in (
+        '<td class="n">1.03</td><td>the best</td>',
+        '<td class="n">2.03</td><td>it meets the noise too, 30 in χ² behind</td>',
+    ):
         assert said in page
     assert "about as well as the others" not in page
 
@@ -355,13 +358,13 @@ def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
         "Placebo",
     ):
         assert title in heads
-    assert "+29 %" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
+    assert "+29\u00a0%" in page and "300" in page and "50" in page  # R_eddy was 80 where 62 is right; rms in nm
     group = (folders["group"] / "report.html").read_text(encoding="utf-8")
     assert "Next experiment" in group and "the coil current by a shunt" in group and "most likely first" in group
     apart = " from ".join(n.replace("_", " ") for n in diagnoses["group"].groups[0])
     assert f"separates {apart}" in group  # no underscores in what people read
     (size,) = map(_size, diagnoses["group"].rivals.values())
-    assert size.startswith("tau = ") and size in group  # what a rival would be
+    assert size.startswith("tau = ") and kept_together(size) in group  # what a rival would be
 
 
 def test_a_misfit_that_is_no_number_is_never_a_verdict(folders, tmp_path):
@@ -392,7 +395,7 @@ def test_a_file_that_cannot_be_used_is_shown_and_the_others_are_told(tmp_path, r
     )
     assert page.count("<svg") == 2 and "The signal at fault" in page
     table = page.split("Recordings that can be read</caption>")[1].split("</table>")[0]
-    assert ">rec_2.csv<" in table and "<td>250 Hz</td>" in table and "rec_0" not in table
+    assert ">rec_2.csv<" in table and '<td class="n">250\u00a0Hz</td>' in table and "rec_0" not in table
     marked = store.load(tmp_path)["offender"]
     first, length = errors[0].shown["first"], errors[0].shown["length"]
     assert marked["span"] == pytest.approx(np.array([first, first + length - 1]) * runs[0][0].dt, rel=1e-5)
@@ -492,8 +495,9 @@ def test_what_repeats_stands_beside_what_a_sample_leaves(folders):
     assert strokes(older)[0] == pytest.approx(np.ptp(loop["measured"]))
     fit = json.loads((folders["fit"] / "fit.json").read_text())
     row = dict(zip((made := recordings_table(fit, evidence))["head"], made["rows"][0], strict=True))
-    assert row["repeating misfit"] == f"{plain(1e9 * misfit[0])} nm" and row["its noise"] == f"{plain(1e9 * noise[0])} nm"
-    assert row["of the stroke"] == f"{plain(100 * misfit[0] / strokes(evidence)[0], 2)} %"
+    shown = [row[k].split()[0] for k in ("repeating misfit", "its noise", "of the stroke")]
+    expected = 1e9 * misfit[0], 1e9 * noise[0], 100 * misfit[0] / strokes(evidence)[0]
+    assert [float(v) for v in shown] == pytest.approx(expected, rel=0.02)
     assert "repeating misfit" not in recordings_table(fit)["head"]  # where the evidence was lost
 
 
@@ -501,8 +505,8 @@ def test_before_and_after_stand_in_one_table(folders):
     page = (folders["attributed"] / "report.html").read_text(encoding="utf-8")
     found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
     table = page.split("Misfit of each recording, before and after</caption>")[1].split("</table>")[0]
-    ends = [plain(found[k]["recordings"][0]["chi2_per_sample"]) for k in ("base", "repaired")]
-    assert f"<td>{ends[0]}</td><td>{ends[1]}</td>" in table and table.count("<tr>") == 4
+    ends = [f"{found[k]['recordings'][0]['chi2_per_sample']:.2f}" for k in ("base", "repaired")]
+    assert f'<td class="n">{ends[0]}</td><td class="n">{ends[1]}</td>' in table and table.count("<tr>") == 4
     assert "Misfit of each recording, before" not in (folders["nothing_missing"] / "report.html").read_text(encoding="utf-8")
     assert (
         "noise of what repeats, in all harmonics" in page
@@ -557,10 +561,10 @@ def test_an_unknown_says_which_boundaries_were_tried_and_why_one_is_framed(folde
     table = page.split("Where a smooth function would serve</caption>")[1].split("</table>")[0]
     said = [re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row) for row in table.split("<tr>")[2:]]
     assert [row[-3:] for row in said] == [
-        ["1.4", "19", "tried, worse"],
-        ["1.19", "13", "kept"],
+        ["1.40", "19.0", "tried, worse"],
+        ["1.19", "13.0", "kept"],
         ["–", "–", "not tried"],
-        ["1.2", "13.5", "not told from it"],
+        ["1.20", "13.5", "not told from it"],
     ]
     assert "need not be the darkest" in page and ">The model with the learned function<" in page
     older = unknown_page(
