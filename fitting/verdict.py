@@ -334,14 +334,14 @@ def _creeps_on(effect, evidence) -> bool:
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
-    text = f"nothing of the catalogue is missing: chi2/N = {evidence.excess:.2f} and "
+    text = f"no effect of the catalogue was found: chi2/N = {evidence.excess:.2f} and "
     if dropped:
         text += f"{dropped}, which serves best, takes less than half of what is above the noise."
     else:
         best = evidence.candidates[0] if evidence.candidates else None
         highest = f"{best.name}, z = {best.z:.1f}" if best else "none"
         earned = "earned its place" if rough else f"scores above {Z_THRESHOLD}"
-        text += f"no effect of the catalogue {earned} (highest: {highest})."
+        text += f"none {earned} (highest: {highest})."
     if rough:
         text += ROUGH_TEXT
     if evidence.absorbed:

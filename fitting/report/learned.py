@@ -49,32 +49,29 @@ def _with_unit(value, unit):
     return f"{plain(factor * value)} {label}"
 
 
+def _place(boundary) -> tuple:
+    """What makes a boundary: its block and its variables."""
+    return boundary["block"], tuple(boundary["variables"])
+
+
+def _choice(boundary, unknown) -> str:
+    """What became of a boundary; "" where the folder does not say."""
+    if _place(boundary) == _place(unknown):
+        return "kept"
+    if _place(boundary) in map(_place, unknown["rivals"]):
+        return "not told from it"
+    return "" if "left_out" not in boundary else "not tried" if boundary["left_out"] is None else "tried, worse"
+
+
 def _boundaries(unknown):
-    rivals = {(r["block"], tuple(r["variables"])) for r in unknown["rivals"]}
+    boundaries, kept = unknown["boundaries"], _place(unknown)
+    told = any("left_out" in b for b in boundaries)  # a folder of before does not say which were tried
+    columns = [tables.aligned([[b.get(key)] for b in boundaries]) for key in ("chi2_per_sample", "left_out")]
     rows = []
-    kept = (unknown["block"], tuple(unknown["variables"]))
-    told = any("left_out" in b for b in unknown["boundaries"])  # a folder of before does not say which were tried
-    columns = [tables.aligned([[b.get(key)] for b in unknown["boundaries"]]) for key in ("chi2_per_sample", "left_out")]
-    fits = [[*a, *b] for a, b in zip(*columns, strict=True)]
-    for rank, b in enumerate(unknown["boundaries"]):
-        place, tried = (b["block"], tuple(b["variables"])), b.get("left_out") is not None
-        if rank >= SHOWN and not tried and place != kept:
-            continue
-        said = (
-            "kept"
-            if place == kept
-            else "not told from it"
-            if place in rivals
-            else "tried, worse"
-            if tried
-            else "not tried"
-            if told
-            else ""
-        )
-        worth = fits[rank] if told else []
-        rows.append(
-            [b["block"], _joined(b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"]), *worth, said]
-        )
+    for rank, (b, chi2, left_out) in enumerate(zip(boundaries, *columns, strict=True)):
+        if rank < SHOWN or b.get("left_out") is not None or _place(b) == kept:
+            first_order = [b["block"], _joined(b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"])]
+            rows.append([*first_order, *((*chi2, *left_out) if told else ()), _choice(b, unknown)])
     note = (
         "Evidence, share and visibility are to first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit "
         "is with a smooth function there than without. Visible: the part of it that density and constants cannot make. The best by evidence "
