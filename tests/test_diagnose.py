@@ -50,6 +50,11 @@ def test_silent_where_nothing_is_missing(bench):
     assert not found.effects and not found.groups and found.repaired is None
     assert {"linear_strain", "mean_field", "reversible_magnetization"} <= set(found.absorbed)
     assert max(abs(c.z) for c in found.candidates) < 5.5
+    finite = {
+        c.name: c.tried_at for c in found.candidates if c.tried_at is not None
+    }  # scored where they are, for want of a first order
+    assert finite["field_diffusion"] == next(c for c in found.candidates if c.name == "field_diffusion").smallest_visible
+    assert "creep" not in finite
     content = found.as_dict()
     assert {"verdict", "effects", "groups", "rivals", "absorbed", "unknown", "data_problem", "candidates", "floors", "where", "check",
             "next_experiment", "placebo", "message", "base", "repaired", "ties"} == set(content)  # fmt: skip

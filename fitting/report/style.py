@@ -104,7 +104,12 @@ def percent(share: float) -> str:
     return "0 %" if share <= 0 else "< 1 %" if share < 0.01 else "> 99 %" if 0.99 < share < 1 else f"{100 * share:.0f} %"
 
 
-SPOKEN = {"delta_e": "ΔE effect", "duffing_stiffness": "Duffing stiffness", "coulomb_friction": "Coulomb friction"}
+SPOKEN = {
+    "delta_e": "ΔE effect",
+    "duffing_stiffness": "Duffing stiffness",
+    "coulomb_friction": "Coulomb friction",
+    "learned_term": "the learned function",
+}
 
 
 def words(name: str) -> str:
