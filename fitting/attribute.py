@@ -203,16 +203,23 @@ def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:
 
     By BIC or by AIC, whichever sees them nearer: shapes are held by priors and cost less than BIC charges.
     """
-    tied = [best]
-    for t in trials:
-        if t is best or not t.physical:
-            continue
-        behind = min(t.bic_change - best.bic_change, best.drop - t.drop + 2 * (t.parameters - best.parameters))
-        weak = min(near[0] * best.drop, near[1]) if t.result.chi2_per_sample < SETTLED_CHI2 else 0.0
-        rest = chi2_of(best.result) if best.result.chi2_per_sample > MISFIT else 0.0
-        if behind < max(TIE, weak, MISFIT_TIE * rest) or (behind < 2 * TIE and _same(t, best)):
-            tied.append(t)
-    return sorted(tied, key=lambda t: t.bic_change)
+    tied = [t for t in trials if t is not best and t.physical and tie_of(best, t, near)]
+    return sorted([best, *tied], key=lambda t: t.bic_change)
+
+
+def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
+    """Why the data do not tell a trial from the best, in words; "" where they do."""
+    behind = min(t.bic_change - best.bic_change, best.drop - t.drop + 2 * (t.parameters - best.parameters))
+    if behind < TIE:
+        return f"its BIC or AIC comes within {TIE:g} of the best's"
+    if t.result.chi2_per_sample < SETTLED_CHI2 and behind < min(near[0] * best.drop, near[1]):
+        foretold = "" if near == WEAK_TIE else ", and with the best the check recordings are still missed about as far as without"
+        return f"it meets the noise too (chi2/N below {SETTLED_CHI2:g}), {behind:.0f} in chi2 behind the best{foretold}"
+    if best.result.chi2_per_sample > MISFIT and behind < MISFIT_TIE * chi2_of(best.result):
+        return f"the best leaves a misfit itself, of which {behind:.0f} in chi2 behind it are less than {MISFIT_TIE:.0%}"
+    if behind < 2 * TIE and _same(t, best):
+        return f"to first order it does the same to the reading, and its BIC or AIC comes within {2 * TIE:g} of the best's"
+    return ""
 
 
 def of_one_family(a: Trial, b: Trial) -> bool:

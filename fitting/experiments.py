@@ -74,7 +74,8 @@ def next_experiment(trials, spectra, bench, also=()) -> dict | None:
         f, A, offset = drives[best]
         unit = DRIVE_UNITS[bench.drive]
         odds = np.minimum(ndtr(0.5 * apart[best]), 0.99)
-        sine = f"four settled periods of {A:.3g} {unit} at {f:.4g} Hz about {offset:.3g} {unit}"
+        frequency = f"{f:.3g}" if f < 1000 else f"{f:.0f}"
+        sine = f"a sine of {frequency} Hz, amplitude {A:.3g} {unit}, offset {offset:.3g} {unit}, four settled periods"
         if odds.min() >= SURE or not wanted:
             found["drive"] = {
                 "kind": "sine",
@@ -88,7 +89,7 @@ def next_experiment(trials, spectra, bench, also=()) -> dict | None:
             parts.append(f"{sine}: separates {', '.join(pairs)}")
         else:
             worst = "" if len(odds) == 1 else " of the nearest two"
-            parts.append(f"no sine within the limits does as well (the best, {sine}, with probability {odds.min():.2f}{worst})")
+            parts.append(f"no sine within the limits does as well (the best: {sine}, with probability {odds.min():.2f}{worst})")
     found["text"] = "; ".join(parts) if len(parts) < 2 or found["drive"] is None else f"{parts[0]}; or {parts[1]}"
     return found
 

@@ -31,6 +31,7 @@ CALM = 0.25  # mean square of the recordings' levels in units of their prior, ab
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 LOST, AT_BOUND = 1e5, 100.0  # chi2/N from which a fit has led nowhere, and one with a parameter at its bound
 VALLEY = 0.98  # correlation from which two parameters are one
+LEARNED = "effects.learned_term."  # its coefficients are many, and held by their prior on purpose: none is named by itself
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
@@ -310,14 +311,17 @@ def recording_fits(problem, residual, recordings, bench):
 
 def valleys(found) -> str:
     """The pairs of parameters that these recordings do not tell apart, in words: their priors do, if any."""
-    pairs = [f"{' and '.join(pair.split('~'))} (correlation {value:.2f})" for pair, value in found.items() if abs(value) > VALLEY]
+    named = {pair: value for pair, value in found.items() if LEARNED not in pair}
+    pairs = [f"{' and '.join(pair.split('~'))} (correlation {value:.2f})" for pair, value in named.items() if abs(value) > VALLEY]
     return f"; a valley: only their priors part {', '.join(pairs)}" if pairs else ""
 
 
 def loose(rows) -> str:
     """The parameters that these recordings do not hold, in words, and why."""
-    found = [f"{e.name} ({e.why})" for e in rows if e.free and not e.identified]
-    return f"; not identified: {', '.join(found)}" if found else ""
+    loose = [e for e in rows if e.free and not e.identified]
+    found = [f"{e.name} ({e.why})" for e in loose if not e.name.startswith(LEARNED)]
+    held = "; a prior holds the coefficients of the learned term" if len(found) < len(loose) else ""
+    return (f"; not identified: {', '.join(found)}" if found else "") + held
 
 
 def guessed(recordings, bench) -> str:
@@ -344,7 +348,7 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
         wrong = swapped(problem.spectra) or "check signs and units of the recordings, and the bench file"
         named = Path(max(rows, key=lambda r: np.nan_to_num(r.chi2_per_sample, nan=np.inf)).file).name
         size = (
-            f"the residual is {np.sqrt(chi2n):.3g} times the noise"
+            f"what repeats is {np.sqrt(chi2n):.3g} times its noise"
             if np.isfinite(chi2n)
             else "the simulation fails at its constants"
         )
@@ -357,16 +361,17 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
     worst = max(rows, key=lambda r: r.chi2_per_sample)
     bound = [e.name for e in parameters if e.at_bound and not e.name.startswith("effects.")]  # where a law's shape ends it may stay
     if bound:
-        far = f", and the residual is {np.sqrt(chi2n):.3g} times the noise (worst: {Path(worst.file).name})" if chi2n > 2 else ""
+        far = f", and what repeats is {np.sqrt(chi2n):.3g} times its noise (worst: {Path(worst.file).name})" if chi2n > 2 else ""
         return f"{', '.join(bound)} sits at its bound{far}; free another parameter or check signs, units and the bench file"
     if chi2n < 1.1 and worst.chi2_per_sample < 1.6:
         return "the recordings are met to their noise; the error bars hold"
     if chi2n > 2:
         return (
-            f"the residual is {np.sqrt(chi2n):.1f} times the noise (worst: {worst.frequency:.4g} Hz), so the error bars do not hold and no "
+            f"what repeats is {np.sqrt(chi2n):.1f} times its noise (worst: {worst.frequency:.4g} Hz), so the error bars do not hold and no "
             "parameter is physical yet; run magjax diagnose on the same files"
         )
+    alone = f", and {worst.chi2_per_sample:.3g} in {Path(worst.file).name}" if chi2n < 1.1 else ""
     return (
-        f"chi2/N = {chi2n:.2f}, a little above the noise; the error bars are too narrow: a rough density, or a weak effect "
+        f"chi2/N = {chi2n:.2f}{alone}, a little above the noise; the error bars are too narrow: a rough density, or a weak effect "
         "(magjax diagnose tells which)"
     )

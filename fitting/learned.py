@@ -37,7 +37,7 @@ BEYOND = 0.25  # of the range seen, shown on either side of it
 class Learned:
     """A term fitted jointly. `left_out`: chi2 per datum of recordings left out, (before, after); `covariance`: of the
     coefficients; `share` of the excess misfit explained; `places`: all boundaries, by the evidence; `rivals`: boundaries
-    whose joint fits do as well."""
+    whose joint fits do as well; `tried`: (place, chi2/N, chi2/N left out) of every joint fit."""
 
     place: Place
     term: LearnedTerm
@@ -47,6 +47,7 @@ class Learned:
     share: float
     places: tuple = dataclasses.field(repr=False, default=())
     rivals: tuple = ()
+    tried: tuple = dataclasses.field(repr=False, default=())
 
     @property
     def worth(self) -> bool:
@@ -166,7 +167,8 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
     # of those that serve as well, the one that the rest of the model hides least: another must be larger to be seen as much
     best, *others = sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: -t.place.visibility)
     rivals = tuple(t.place for t in others)
-    return dataclasses.replace(best, places=tuple(places), rivals=rivals)
+    fits = tuple((t.place, float(t.result.chi2_per_sample), float(t.left_out[1])) for t in tried)
+    return dataclasses.replace(best, places=tuple(places), rivals=rivals, tried=fits)
 
 
 def band(learned: Learned, *values):
@@ -262,13 +264,17 @@ def described(learned: Learned) -> dict:
 
     units = [terms.unit_of(UNITS[v]).replace("reading", reading) for v in term.variables]
     axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(low, high, strict=True)), indexing="ij")
+    fits = {id(place): worth for place, *worth in learned.tried}
     return {
         "variables": named(learned.place), "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
         "left_out": list(learned.left_out), "bends_over": learned.place.length,
         "function": {"x": x.tolist(), "slices": slices},
         "boundaries": [
-            {"block": p.block, "variables": named(p), "evidence": p.evidence, "share": p.share, "visibility": p.visibility}
+            {
+                "block": p.block, "variables": named(p), "evidence": p.evidence, "share": p.share, "visibility": p.visibility,
+                **dict(zip(("chi2_per_sample", "left_out"), fits.get(id(p), (None, None)), strict=True)),
+            }
             for p in learned.places
         ],
         "rivals": [{"block": p.block, "variables": named(p)} for p in learned.rivals],

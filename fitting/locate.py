@@ -37,10 +37,10 @@ def where(result, candidates, recordings, output) -> dict:
     def rms(parts):
         return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
-    total = float(power.sum())
+    above = above_noise(float(power.sum()), result.data_count)
     blocks = {}
-    for c in candidates:
-        blocks[c.block] = max(blocks.get(c.block, 0.0), min(c.predicted_chi2_drop / max(total, 1e-9), 1.0))
+    for c in candidates:  # the best first: of blocks that take all, the first named is the one whose effect scores highest
+        blocks[c.block] = max(blocks.get(c.block, 0.0), min(c.predicted_chi2_drop / above, 1.0))
     return {
         "by_recording": {r.file.rsplit("/", 1)[-1]: r.chi2_per_sample for r in result.recordings},
         "by_harmonic": [float(v) for v in power.sum(axis=0) / (R * count)],
@@ -49,3 +49,8 @@ def where(result, candidates, recordings, output) -> dict:
         "by_period": period,
         "by_block": blocks,
     }
+
+
+def above_noise(chi2: float, count: int) -> float:
+    """What of chi2 over `count` numbers is above the noise: at least one standard deviation of what noise alone would give."""
+    return max(chi2 - count, float(np.sqrt(2 * count)))

@@ -53,7 +53,8 @@ SHAPE_GRIDS = {
 @dataclasses.dataclass(frozen=True)
 class Candidate:
     """One effect's score. `amplitude`: first-order estimate in its unit; `shapes`: best of the grid;
-    `smallest_visible`: amplitude seen at five standard deviations; `direction`: projected unit column."""
+    `smallest_visible`: amplitude seen at five standard deviations; `tried_at`: the finite amplitude that was scored, where it
+    was (what is visible is then not known, and both others are that); `direction`: projected unit column."""
 
     name: str
     block: str
@@ -65,6 +66,7 @@ class Candidate:
     smallest_visible: float
     one_sided: bool
     direction: np.ndarray = dataclasses.field(repr=False, default=None)
+    tried_at: float | None = None
     achieved_chi2_drop: float | None = None
     bic_change: float | None = None
 
@@ -222,11 +224,13 @@ def screen(problem, solution) -> list[Candidate]:
         if length / size < 1e-4:
             z = 0.0
         amplitude, visible = score / max(length, 1e-300), float(5 / max(length, 1e-300))
-        if effect.amplitude in shapes:  # scored at a finite amplitude: start the fit there
-            amplitude, visible = shapes[effect.amplitude], shapes[effect.amplitude]
+        tried_at = shapes.get(effect.amplitude)
+        if tried_at is not None:  # scored at a finite amplitude: start the fit there
+            amplitude = visible = tried_at
             shapes = {k: v for k, v in shapes.items() if k != effect.amplitude}
         candidate = Candidate(
             effect.name, effect.block, z, float(length / size), amplitude, shapes, float(z * z), visible, one_sided, part / max(length, 1e-300),
+            None if tried_at is None else float(tried_at),
         )  # fmt: skip
         if effect.name not in best or abs(candidate.z) > abs(best[effect.name].z):
             best[effect.name] = candidate

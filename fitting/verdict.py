@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.effects import CLASSES
 
-from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, confidence, rivals_of
+from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, confidence, rivals_of, tie_of
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .instruments import exchange
@@ -55,6 +55,7 @@ class Diagnosis:
     effects: tuple = ()
     groups: tuple = ()
     rivals: dict = dataclasses.field(default_factory=dict)
+    ties: dict = dataclasses.field(default_factory=dict)
     absorbed: tuple = ()
     unknown: dict | None = None
     data_problem: str | None = None
@@ -98,13 +99,13 @@ class Diagnosis:
             {
                 "name": c.name, "z": c.z, "visibility": c.visibility, "amplitude": c.amplitude,
                 "predicted_chi2_drop": c.predicted_chi2_drop, "achieved_chi2_drop": c.achieved_chi2_drop,
-                "bic_change": c.bic_change, "smallest_visible": c.smallest_visible,
+                "bic_change": c.bic_change, "smallest_visible": c.smallest_visible, "tried_at": c.tried_at,
             }
             for c in self.candidates
         ]  # fmt: skip
         return {
             "verdict": self.verdict, "effects": list(self.effects), "groups": [list(g) for g in self.groups],
-            "rivals": self.rivals, "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
+            "rivals": self.rivals, "ties": self.ties, "absorbed": list(self.absorbed), "unknown": self.unknown, "data_problem": self.data_problem, "candidates": ranked,
             "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
             "placebo": self.placebo, "message": self._said(), "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
@@ -154,6 +155,15 @@ class Evidence:
         """Whether the current that drives the model is a command nobody measured."""
         measured = all(r.origin.get("metadata", {}).get("current") == "measured" for r in self.recordings)
         return self.bench.drive == "current" and not measured
+
+
+def unusable(errors, sound=()) -> Diagnosis:
+    """The verdict over files that cannot be used, by their errors; `sound`: the recordings that can."""
+    text = " ".join(f"{error}." for error in errors)
+    if sound:
+        others = "The other recording" if len(sound) == 1 else f"The other {len(sound)} recordings"
+        text += f" {others} can be read and {'is' if len(sound) == 1 else 'are'} not clipped."
+    return Diagnosis("data_problem", text, data_problem=str(errors[0]))
 
 
 def misfit(rows, which: str) -> float:
@@ -212,7 +222,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         groups.append(["sensor_lag", "second_mode"])
     asked = instrument_request({"source", "sensor"} if evidence.command_only else {"sensor"}) if swap else None
     if groups:
-        found = _grouped(evidence, common | {"rivals": sizes}, effects, groups, rivals, swap, asked)
+        found = _grouped(evidence, common | {"rivals": sizes, "ties": _ties(evidence)}, effects, groups, rivals, swap, asked)
     else:
         found = _attributed(evidence, common, effects, swap, asked)
     form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
@@ -306,6 +316,20 @@ def _found(evidence):
     return effects, groups, sizes, last
 
 
+def _ties(evidence) -> dict:
+    """For each member of a group what a fit with it reached, and why it is not told from the best: name -> chi2_per_sample, why."""
+    ties = {}
+    for effect, rivals in evidence.adopted:
+        why = "between the harmonics its score comes near the best's"
+        ties |= {r.name: {"chi2_per_sample": None, "why": why if r is not effect else ""} for r in (effect, *rivals) if rivals}
+    for best, rivals, *_ in evidence.reached.steps:
+        for t in rivals if len(rivals) > 1 else ():
+            result = evidence.reached.current if t is best else t.result
+            why = "" if t is best else tie_of(best, t) or tie_of(best, t, UNCONFIRMED_TIE)
+            ties[t.name] = {"chi2_per_sample": result.chi2_per_sample, "why": why}
+    return ties
+
+
 def _creeps_on(effect, evidence) -> bool:
     """Whether a drift within the records is a creep that was found, going on: all but a fifth of it to one side of the mean
     displacement, away from where all came from, and less than a decade of it."""
@@ -333,14 +357,14 @@ def _behind(effect, evidence) -> str | None:
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
-    text = f"nothing of the catalogue is missing: chi2/N = {evidence.excess:.2f} and "
+    text = f"no effect of the catalogue was found: chi2/N = {evidence.excess:.2f} and "
     if dropped:
         text += f"{dropped}, which serves best, takes less than half of what is above the noise."
     else:
         best = evidence.candidates[0] if evidence.candidates else None
         highest = f"{best.name}, z = {best.z:.1f}" if best else "none"
         earned = "earned its place" if rough else f"scores above {Z_THRESHOLD}"
-        text += f"no effect of the catalogue {earned} (highest: {highest})."
+        text += f"none {earned} (highest: {highest})."
     if rough:
         text += ROUGH_TEXT
     if evidence.absorbed:
@@ -358,7 +382,13 @@ def _grouped(evidence, common, effects, groups, rivals, swap, asked) -> Diagnosi
     also = INSTRUMENTS if between and evidence.excess > MISFIT and evidence.command_only else ()
     experiment = asked or (next_experiment(rivals, evidence.raw.spectra, evidence.bench, also) if rivals else None)
     names = "; ".join(" or ".join(g) for g in groups)
-    text = f"something is missing that these recordings cannot tell apart: {names}."
+    number = {2: "two", 3: "three", 4: "four"}.get(len(groups[0]), "several")
+    each = (
+        f"{number} effects would each explain what is missing"
+        if len(groups) == 1
+        else "more than one effect explains what is missing"
+    )
+    text = f"{each}, and these recordings cannot tell them apart: {names}."
     if effects:
         text += f" Found beside it: {', '.join(e['name'] for e in effects)}."
     if swap:

@@ -12,6 +12,7 @@ measured.
 import numpy as np
 
 from .errors import RecordingError
+from .plausibility import UNITS, si_unit
 
 FEWEST = 5  # samples that rest: an honest crest leaves two equal ones on its top, three with some luck
 MOST_JUDGED = 16  # crests, evenly over the record
@@ -69,11 +70,14 @@ def _in_noise(values: np.ndarray) -> float:
 def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarray | None = None):
     """Raise `RecordingError` where a channel, (time,), is clipped or stuck; `drive`, (time,): what may hold still meanwhile."""
     values = np.asarray(values, float)
+    unit = "V" if "emf" in channel else si_unit(channel) if channel in UNITS else ""
+    per = f" {unit}".rstrip()
     stuck = stuck_stretch(values)
     if stuck is not None:
         raise RecordingError(
-            f"{name}: {channel} stands still at {values[stuck[0]]:.6g} for {stuck[1]} samples from sample {stuck[0]}, in which its "
-            "noise is gone: samples were lost or the converter hung; record again or cut there"
+            f"{name}: {channel} stands still at {values[stuck[0]]:.4g}{per} for {stuck[1]} samples from sample {stuck[0]}, in which its "
+            "noise is gone: samples were lost or the converter hung; record again or cut there",
+            _shown(channel, unit, values, *stuck),
         )
     for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
         found = clipped_crest(sign * values, drive) or cut_in_noise(sign * values)
@@ -81,9 +85,15 @@ def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarr
             first, length = found
             level = float(np.median(values[first : first + length]))
             raise RecordingError(
-                f"{name}: {channel} is clipped at its {word} value {level:.6g} for {length} samples from sample {first}; "
-                "lower the gain or the drive and record again"
+                f"{name}: {channel} is clipped at its {word} value {level:.4g}{per} for {length} samples from sample {first}; "
+                "lower the gain or the drive and record again",
+                _shown(channel, unit, values, first, length),
             )
+
+
+def _shown(channel, unit, values, first, length) -> dict:
+    """Where a channel, (time,), is at fault, as a `RecordingError` holds it."""
+    return {"channel": channel, "unit": unit, "values": values, "first": int(first), "length": int(length)}
 
 
 def clipped_crest(x: np.ndarray, drive: np.ndarray | None = None) -> tuple[int, int] | None:

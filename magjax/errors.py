@@ -14,9 +14,16 @@ class ConfigurationError(MagjaxError):
 
 
 class RecordingError(MagjaxError):
-    """A recording that cannot be used as it is (exit status 3)."""
+    """A recording that cannot be used as it is (exit status 3).
+
+    `shown`: where it shows, for a picture, if that is known: channel, unit, values, first sample, samples, and time.
+    """
 
     exit_status = 3
+
+    def __init__(self, text: str = "", shown: dict | None = None):
+        super().__init__(text)
+        self.shown = shown
 
 
 class DeviceError(MagjaxError):

@@ -43,6 +43,17 @@ def load_recordings(paths, bench) -> list[Recording]:
     return recordings
 
 
+def load_sound(paths, bench) -> tuple[list[Recording], list[RecordingError]]:
+    """The recordings that can be used, and the error of each file that cannot."""
+    recordings, errors = [], []
+    for path in paths:
+        try:
+            recordings += load_recordings([path], bench)
+        except RecordingError as error:
+            errors.append(error)
+    return recordings, errors
+
+
 def load_checks(paths, bench) -> tuple[list[Recording], tuple[str, ...]]:
     """Recordings to check against, and a sentence for each that cannot be used: no fit needs them, so they end none.
 
@@ -306,7 +317,11 @@ def _refuse_clipping(name, columns, bench):
     for quantity, values in columns.items():
         if quantity not in ("time", *BYSTANDERS):
             what = f"the emf of {quantity}" if "emf_turns" in bench.columns.get(quantity, {}) else quantity
-            refuse_clipping(name, what, values, None if quantity == bench.drive else columns[bench.drive])
+            try:
+                refuse_clipping(name, what, values, None if quantity == bench.drive else columns[bench.drive])
+            except RecordingError as error:
+                error.shown = {**error.shown, "name": name, "time": columns.get("time")}
+                raise
 
 
 def _column(table, quantity, column):

@@ -8,14 +8,25 @@ import pytest
 
 import fitting.attribute
 import fitting.search
-from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of
+from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of, tie_of
 from fitting.record_level import RecordEffect
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
 from fitting.uncertainty import Estimate
-from fitting.verdict import Evidence, _behind, _creeps_on, _sizes, dominant, first_alone, too_little, unconfirmed
+from fitting.verdict import (
+    Evidence,
+    _behind,
+    _creeps_on,
+    _grouped,
+    _sizes,
+    _ties,
+    dominant,
+    first_alone,
+    too_little,
+    unconfirmed,
+)  # fmt: skip
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -71,6 +82,7 @@ def test_rivals_are_those_that_the_data_do_not_tell_apart():
     unphysical = trial("excess_loss", 1.19, physical=False)
     assert best.bic_change - by_parameters.bic_change == pytest.approx(0.7 - 2 * np.log(COUNT))
     assert names(rivals_of(best, [best, by_parameters, behind, unphysical])) == ["backlash", "coulomb_friction"]
+    assert "within 9" in tie_of(best, by_parameters) and tie_of(best, behind) == ""
 
 
 def test_a_name_that_no_check_recording_confirms_has_more_rivals():
@@ -83,6 +95,12 @@ def test_a_name_that_no_check_recording_confirms_has_more_rivals():
     assert names(rivals_of(best, [best, near, far])) == ["structural_damping"]
     reached = unconfirmed(Reached(best.result, [(best, [best], [best, near, far], None)], {}))
     assert names(reached.steps[0][1]) == ["structural_damping", "magnetic_aftereffect"]
+    ties = _ties(SimpleNamespace(adopted=(), reached=reached))
+    assert ties["structural_damping"] == {"chi2_per_sample": 0.959, "why": ""} and list(ties) == names(reached.steps[0][1])
+    assert ties["magnetic_aftereffect"]["chi2_per_sample"] == 1.0
+    assert (
+        "meets the noise too" in (why := ties["magnetic_aftereffect"]["why"]) and "29 in chi2" in why and "check recordings" in why
+    )
 
 
 @pytest.mark.parametrize(
@@ -111,9 +129,23 @@ def test_an_effect_that_leaves_far_less_than_all_others_is_named_whatever_its_fo
         assert [t.name for t, *_ in first.reached.steps] == ["coulomb_friction"] and first.excess == 3.4
 
 
+@pytest.mark.parametrize(
+    ("groups", "said"),
+    [
+        ([["creep", "delta_e"]], "two effects would each explain what is missing, and these recordings cannot tell them apart: creep or delta_e."),
+        ([["a", "b", "c"]], "three effects would each explain what is missing, and these recordings cannot tell them apart: a or b or c."),
+        ([["a", "b"], ["c", "d"]], "more than one effect explains what is missing, and these recordings cannot tell them apart: a or b; c or d."),
+    ],
+)  # fmt: skip
+def test_a_group_is_told_in_a_sentence(groups, said):
+    evidence = SimpleNamespace(excess=1.0, command_only=False)
+    assert _grouped(evidence, {}, [], groups, [], None, None).message == said
+
+
 def test_rivals_where_the_best_is_not_the_whole_truth():
     best, near, far = trial("second_mode", 2.0, base=300.0), trial("sensor_lag", 2.15, base=300.0), trial("creep", 2.5, base=300.0)
     assert names(rivals_of(best, [best, near, far])) == ["second_mode", "sensor_lag"]
+    assert "leaves a misfit itself" in tie_of(best, near) and not tie_of(best, far)
 
 
 def test_confidence_falls_with_rivals_and_with_what_is_left():

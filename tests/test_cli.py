@@ -248,7 +248,7 @@ def test_the_papers_loops_and_recipe(tmp_path, capsys, monkeypatch):
     assert recipe["frequencies"] == pytest.approx([20, 100, 200]) and np.shape(recipe["xi"]) == (3, 3)
     page = (tmp_path / "paper.html").read_text()
     for R, row in zip(recipe["resistances"], recipe["xi"], strict=True):
-        cells = f">{R:g}</th>" + "".join(f"<td>{x:.4f}</td>" for x in row)
+        cells = f">{R:g}</th>" + "".join(f'<td class="n">{x:.4f}</td>' for x in row)
         assert cells in "".join(line.strip() for line in page.splitlines())
     for name, curves, words in (
         ("paper_loops", 6, ("[-0.7, 0.9] A", "[-0.7, 0.3] A", "20 Hz", "200 Hz", "displacement")),

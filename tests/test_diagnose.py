@@ -44,15 +44,20 @@ def test_silent_where_nothing_is_missing(bench):
     found = diagnose(runs, bench, check=checks, choices=Choices(fine=250))
     assert (
         found.verdict == "nothing_missing"
-        and "nothing of the catalogue is missing" in str(found)
+        and "no effect of the catalogue was found" in str(found)
         and "A wrong c0, H_bias or lambda_s in" in str(found)
     )
     assert not found.effects and not found.groups and found.repaired is None
     assert {"linear_strain", "mean_field", "reversible_magnetization"} <= set(found.absorbed)
     assert max(abs(c.z) for c in found.candidates) < 5.5
+    finite = {
+        c.name: c.tried_at for c in found.candidates if c.tried_at is not None
+    }  # scored where they are, for want of a first order
+    assert finite["field_diffusion"] == next(c for c in found.candidates if c.name == "field_diffusion").smallest_visible
+    assert "creep" not in finite
     content = found.as_dict()
     assert {"verdict", "effects", "groups", "rivals", "absorbed", "unknown", "data_problem", "candidates", "floors", "where", "check",
-            "next_experiment", "placebo", "message", "base", "repaired"} == set(content)  # fmt: skip
+            "next_experiment", "placebo", "message", "base", "repaired", "ties"} == set(content)  # fmt: skip
 
 
 def test_the_base_of_a_diagnosis_is_that_on_the_finer_density_that_was_asked_for(bench):

@@ -68,6 +68,7 @@ def test_a_sine_is_proposed_only_where_it_decides(monkeypatch, gap, sine):
     assert found["channels"] == [CALIBRATION] and found["text"].startswith("record a calibration")
     assert (found["drive"] is not None) == sine and bool(found["separates"]) == sine
     if sine:
+        assert "; or a sine of 44.7 Hz, amplitude 0.4 A, offset 0.1 A, four settled periods: separates" in found["text"]
         assert found["drive"]["frequency_Hz"] == pytest.approx(drives[3][0]) and found["separates"][0][:2] == [
             "sensor_lag",
             "delta_e",

@@ -16,7 +16,7 @@ import magjax.bench
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import DensityBasis, cell_basis, hat_basis
-from fitting.fit import finer_than, fit, guessed, loose
+from fitting.fit import finer_than, fit, guessed, loose, valleys
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
@@ -143,6 +143,9 @@ def test_a_gauge_is_told_with_what_makes_up_for_it(recordings, bench, result):
     free = fit(recordings, bench, extra=("coil.H_bias",), choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
     bias = free.estimate("coil.H_bias")
     assert not bias.identified and "density moved" in bias.why and "not identified: coil.H_bias" in loose(free.estimates)
+    learned = dataclasses.replace(bias, name="effects.learned_term.c0")
+    assert loose([learned]) == "; a prior holds the coefficients of the learned term"
+    assert valleys({"effects.learned_term.c0~effects.learned_term.c1": 1.0}) == "" and "coil.a" in valleys({"coil.a~coil.b": 1.0})
     assert 0.5 < result.cells["switched"] / result.cells["all"] < 1
 
 

@@ -183,6 +183,12 @@ def test_the_band_widens_beyond_what_was_seen():
     result = types.SimpleNamespace(recordings=[types.SimpleNamespace(unit="m")], bench=load_bench("aa-050h"))
     learned = dataclasses.replace(learned, result=result)
     content = described(learned)
+    other = dataclasses.replace(place, block="sensor")
+    tried = described(dataclasses.replace(learned, places=(place, other), tried=((place, 1.2, 1.6),)))["boundaries"]
+    assert [(b["block"], b["chi2_per_sample"], b["left_out"]) for b in tried] == [
+        ("magnetostriction", 1.2, 1.6),
+        ("sensor", None, None),
+    ]
     assert content["seen"] == [[0.0, 2e4]] and len(content["function"]["x"]) == len(content["function"]["slices"][0]["low"])
 
 

@@ -127,5 +127,7 @@ def test_the_screening_scores_it_at_its_finite_size():
     rng = np.random.default_rng(0)
     runs = [record(truth, f, a, 0.05, rng, f"{f}") for f, a in ((10, 0.8), (40, 0.4), (100, 0.8), (200, 0.4), (300, 0.8))]
     found = fit(runs, load_bench("aa-050h"), choices=Choices(fine=250, knots=(12, 9), level=48, rest="negative"), refine=False)
-    best = next(c for c in screen(found.problem, found.refined) if c.name == "field_diffusion")
+    scores = {c.name: c for c in screen(found.problem, found.refined)}
+    best = scores["field_diffusion"]
+    assert best.tried_at == best.amplitude == best.smallest_visible and scores["creep"].tried_at is None
     assert best.z > 5 and best.amplitude == 0.5 and not best.shapes

@@ -215,7 +215,7 @@ def test_a_fit_that_has_led_nowhere_says_so():
         told = outcome(chi2n, rows, solution, (), SimpleNamespace(spectra=()))
         assert told.startswith("the fit has led nowhere") and "r400000.0.csv" in told and "\n" not in told
     at = (SimpleNamespace(name="mechanics.xi", at_bound=True),)
-    assert "20 times the noise (worst: r400000.0.csv)" in outcome(400.0, rows, solution, at, SimpleNamespace(spectra=()))
+    assert "20 times its noise (worst: r400000.0.csv)" in outcome(400.0, rows, solution, at, SimpleNamespace(spectra=()))
 
 
 def test_numbers_that_are_none_are_null_in_json():

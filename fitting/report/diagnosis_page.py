@@ -2,12 +2,15 @@
 
 import json
 import math
+import re
+from pathlib import Path
 
 from . import found as pictures
 from . import learned, loops, misfit, plane, tables
-from .fit_page import AT_NOISE, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
+from .fit_page import AT_NOISE, DEFINED, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
-from .style import percent, plain, scale_of, terms_in, unit_text
+from .residuals import repeating
+from .style import percent, plain, scale_of, terms_in, unit_text, words
 
 TONES = {
     "nothing_missing": "good",
@@ -18,6 +21,13 @@ TONES = {
     "data_problem": "bad",
 }
 RUN_PLACEBO = "To run it: add --placebo 20 to the command that made this folder."
+HERE = re.compile(r"; run magjax diagnose on the same files| \(magjax diagnose tells which\)")  # a fit's advice, followed here
+FILE = re.compile(r"(?:^|[.] )(\S+[.]\w+): ")  # that an error begins with
+FRAMED = (
+    "The framed block need not be the darkest. The shades are of single effects of the catalogue, to first order; the frame stands where a "
+    "smooth function that was fitted jointly with all else foretells recordings left out best, or, of those that foretell them about as well, "
+    "where the rest of the model hides it least."
+)
 FORETOLD = 1.4  # times its noise, up to which a check recording is foretold
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
@@ -37,23 +47,31 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         _groups(found, facts),
         _unknown(found, sketch),
         section("Next experiment", *_next(found, names)),
-        section("The recordings as they are", sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings"))),
+        section("The signal at fault", sketch(evidence.get("offender"), loops.offender, evidence.get("offender"))),
+        section(
+            "The recordings as they are",
+            part(table=None if fit else tables.as_recorded(evidence.get("recordings"))),
+            sketch(evidence.get("recordings"), loops.periods, evidence.get("recordings")),
+        ),
         _checks(found, evidence, sketch, output, drive),
-        _where(found, facts, base, sketch, output, drive),
+        _where(found, facts, base, repaired, sketch, output, drive),
         _ranking(found, facts, sketch),
         _loops(found, base, repaired, sketch, output, drive),
         _left(found, base, repaired, sketch, output),
         _shifts(found),
         placebo_section(found.get("placebo"), "data_problem" if broken else found["verdict"]),
         *_models(found, evidence, sketch, drive),
-        section("Floors", part(table=_floors(found, output))),
+        section("Floors", part(table=_floors(found, base, output))),
     ]
     count = len(fit.get("recordings", []))
     plural = lambda n, what: f"{n} {what}{'' if n == 1 else 's'}"
+    name = fit["bench"] if fit else str(evidence.get("bench", ""))
     about = (
-        f"Bench {fit['bench']}; {plural(count, 'recording')}, {plural(len(found['check']), 'check recording')}."
+        f"Bench {name}; {plural(count, 'recording')}, {plural(len(found['check']), 'check recording')}."
         if fit
-        else "No model could be fitted."
+        else f"Bench {name}; no fit was tried."
+        if name
+        else "No fit was tried."
     )
     said = (
         "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file."
@@ -61,15 +79,10 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         else ""
     )
     return {
-        "title": f"Diagnosis of {fit['bench']}" if fit else "Diagnosis", "facts": about, "tone": "bad" if broken else tone(found),
+        "title": f"Diagnosis of {name}" if name else "Diagnosis", "facts": about, "tone": "bad" if broken else tone(found),
         "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
-        "message": [said or sentence(spoken(found["message"], names))], "sections": [s for s in sections if s],
+        "message": [said or sentence(spoken(found["message"], names))], "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
     }  # fmt: skip
-
-
-def words(name: str) -> str:
-    """An effect's name as people say it."""
-    return name.replace("_", " ")
 
 
 def spoken(text: str, names) -> str:
@@ -92,7 +105,7 @@ def still_left(found) -> str:
     if chi2 > AT_NOISE:
         said.append(f"a misfit of χ²/N = {plain(chi2)} is left")
     elif worst and worst["chi2_per_sample"] > WORST_AT_NOISE:
-        said.append(f"one recording is left with a misfit of χ²/N = {plain(worst['chi2_per_sample'])}")
+        said.append(f"{Path(worst['file']).name} is left with a misfit of χ²/N = {plain(worst['chi2_per_sample'])}")
     missed = [r for r in found["check"] if r["noise_rms"] and r["rms_after"] > FORETOLD * r["noise_rms"]]
     if missed:
         r = max(missed, key=lambda r: r["rms_after"] / r["noise_rms"])
@@ -115,20 +128,43 @@ def headline(found) -> str:
         found_beside = f"; found beside it: {beside}" if beside else ""
         return f"Something is missing, and these recordings cannot say which: {names}{found_beside}"
     if verdict == "nothing_missing" and (left := still_left(found)):
-        return f"Nothing of the catalogue is missing; {left}"
+        return f"No effect of the catalogue was found{_judged(found)}; {left}"
     if verdict == "unknown_at":
         where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
         return f"Something is missing that no effect of the catalogue explains; it acts most like the block {where}"
     return {
         "nothing_missing": "Nothing is missing: the model meets the recordings to their noise",
         "absorbed": "What may be missing cannot show in these recordings: the density absorbs it",
-        "data_problem": "The recordings or the bench file must be mended first; no physics is judged",
+        "data_problem": f"{_at_fault(found)} must be mended first; no physics is judged",
     }.get(verdict, words(verdict))
+
+
+def _at_fault(found) -> str:
+    """What a data problem asks to be mended."""
+    text = f"{found['message']} {found['data_problem'] or ''}"
+    bench = "[columns" in text or "bench file" in text
+    files = list(dict.fromkeys(Path(name).name for name in FILE.findall(text)))
+    if bench and (files or "leave it out" in text):
+        return "The recordings or the bench file"
+    return "The bench file" if bench else " and ".join(files) or "The recordings"
+
+
+def _judged(found) -> str:
+    """How many effects could be judged: the density does not hide them."""
+    number = len(found["candidates"])
+    absorbed = {c["name"] for c in found["candidates"]} & set(found["absorbed"])
+    return f" ({number - len(absorbed)} of {number} could be judged)" if number else ""
+
+
+def _doubt(fit) -> str:
+    """What is wrong with the standard errors of a fit, "" where nothing is or there is none."""
+    return validity(fit)[3] if fit else ""
 
 
 def _named(found, facts):
     if not found["effects"]:
         return None
+    doubt = _doubt(found["repaired"])
     rows, laws = [], []
     for e in found["effects"]:
         rows.append([words(e["name"]), e["block"], _size(e["parameters"]), plain(e["confidence"], 2)])
@@ -138,7 +174,11 @@ def _named(found, facts):
     note = "Confidence: probability of the effect among those that were fitted, times the share of the excess misfit that it takes."
     return section(
         "What was left out",
-        part(table=tables.table("Effects found", ["effect", "block", "size", "confidence"], rows, note)),
+        part(
+            table=tables.table(
+                "Effects found", ["effect", "block", f"size (± {doubt})" if doubt else "size", "confidence"], rows, note
+            )
+        ),
         part(bullets=laws),
     )
 
@@ -154,17 +194,35 @@ def _size(parameters) -> str:
 def _groups(found, facts):
     if not found["groups"]:
         return None
-    rows = []
+    rows, ties = [], found.get("ties", {})
     for number, group in enumerate(found["groups"], 1):
         for place, name in enumerate(group, 1):
             about = facts.get(name, {})
             size = _size(found.get("rivals", {}).get(name, {}))
-            rows.append([words(name), number, place, about.get("block", ""), size, about.get("signature", "")])
-    text = "Each of these would repair the model about as well as the others; to name one from these recordings would be a guess."
-    head = ["rival", "group", "rank in its group", "block", "size, were it this", "how it shows"]
+            row = [words(name), number, place, about.get("block", ""), size]
+            tie = ties.get(name, {"chi2_per_sample": None, "why": ""})
+            why = tie["why"] or ("the best" if name in ties else "")
+            row += [plain(tie["chi2_per_sample"]), said_of(why)] if ties else []
+            rows.append([*row, about.get("signature", "")])
+    text = "Each of these repairs the model, and to name one from these recordings would be a guess."
+    text += " Why each is not told from the best stands beside it; χ²/N is that of a fit with it." if ties else ""
+    head = [
+        "rival",
+        "group",
+        "rank in its group",
+        "block",
+        "size, were it this",
+        *(("χ²/N", "why it is in the group") if ties else ()),
+        "how it shows",
+    ]
     return section(
         "Not told apart by these recordings", part(text=text, table=tables.table("Rivals, most likely first", head, rows))
     )
+
+
+def said_of(text: str) -> str:
+    """A phrase of the search in the signs of the page."""
+    return text.replace("chi2", "χ²")
 
 
 def _unknown(found, sketch):
@@ -220,13 +278,15 @@ def added(found) -> str:
 
 
 def _loops(found, base, repaired, sketch, output, drive):
-    if not base or not base["chosen"].size:
-        return None
     title = "Fitted recordings, before and after" if repaired else "Measured and fitted loops"
-    return section(title, sketch(base, loops.loops, base, output, drive, repaired or None, added(found)))
+    return section(
+        title,
+        part(table=tables.before_and_after(found["base"], found["repaired"], (base, repaired))),
+        sketch(base and base["chosen"].size, loops.loops, base, output, drive, repaired or None, added(found)),
+    )
 
 
-def _where(found, facts, base, sketch, output, drive):
+def _where(found, facts, base, repaired, sketch, output, drive):
     where = found["where"]
     if not where or not base:
         return None
@@ -235,8 +295,11 @@ def _where(found, facts, base, sketch, output, drive):
     marks |= {found["unknown"]["block"]: "acts most like this"} if found["unknown"] else {}
     return section(
         "Where simulation and recordings differ",
+        part(text=FRAMED if "function" in (found["unknown"] or {}) else ""),
         sketch(where.get("by_block"), pictures.block_map, where, marks, drive),
-        *headed("Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base)),
+        *headed(
+            "Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base, beside=repaired)
+        ),
         *headed(
             f"By branch, {terms_in(base).field} and period", sketch(where.get("by_branch"), pictures.places, where, base, output)
         ),
@@ -247,10 +310,16 @@ def power(candidate, facts) -> str:
     """Probability that these recordings would show the effect at the top of its typical range."""
     typical = facts.get(candidate["name"], {}).get("typical")
     visible = candidate["smallest_visible"]
-    if not typical or not visible or not math.isfinite(visible):
+    if not typical or not visible or tried_at(candidate) is not None or not math.isfinite(visible):
         return "–"
     z = SEEN_AT * typical / visible
     return percent(0.5 * (1 + math.erf((z - pictures.THRESHOLD) / math.sqrt(2))))
+
+
+def tried_at(candidate) -> float | None:
+    """The finite amplitude at which a candidate was scored, None where its score is to first order."""
+    same = candidate["amplitude"] == candidate["smallest_visible"]  # so it was stored before it was told
+    return candidate.get("tried_at", candidate["amplitude"] if same else None)
 
 
 def _ranking(found, facts, sketch):
@@ -266,8 +335,11 @@ def _ranking(found, facts, sketch):
         fell = "not fitted" if drop is None else plain(drop) if drop >= 0 else f"rose by {plain(-drop)}"
         strong = "–" if c["name"] in found["absorbed"] else power(c, facts)
         bic = plain(c["bic_change"]) if c["bic_change"] is not None else ""
-        rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), f"{plain(c['amplitude'])}{unit}",
-                     f"{plain(c['smallest_visible'])}{unit}", strong, plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
+        finite = tried_at(c)
+        size = f"{plain(c['amplitude'])}{unit}" if finite is None else f"tried at {plain(finite)}{unit}"
+        seen = f"{plain(c['smallest_visible'])}{unit}" if finite is None else "–"
+        rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), size, seen, strong,
+                     plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
     head = [
         "effect",
         "block",
@@ -283,8 +355,15 @@ def _ranking(found, facts, sketch):
     note = (
         "z: score in standard deviations. Visibility: what share of its mark the base model cannot imitate. Visible from: amplitude seen at five "
         "standard deviations. Power: probability that these recordings would show the effect at the top of its typical range. Achieved: what "
-        "a fit with the effect took, that of an adopted one as it ended; where χ² rose, the fit did not settle."
+        "a fit with the effect took, that of an adopted one as it ended, on a density that may be finer by then than its rivals'; where χ² rose, "
+        "the fit did not settle."
     )
+    if any(tried_at(c) is not None for c in ranked):
+        note += (
+            " Tried at: scored at this amplitude, for it has no mark to first order; from where it would be visible is not known."
+        )
+    if any(c["z"] == 0 and c["amplitude"] < 0 for c in ranked):
+        note += " A z of 0 beside an amplitude below 0: the misfit asks for the sign that the effect cannot have."
     absorbed = ", ".join(words(n) for n in found["absorbed"])
     text = f"These recordings could not show {absorbed}: the density imitates them." if absorbed else ""
     drawn = sketch(ranked, pictures.ranking, ranked)
@@ -298,6 +377,8 @@ def _ranking(found, facts, sketch):
 
 def repair_words(found) -> str:
     """What to call the model with the additions of the search."""
+    if "function" in (found["unknown"] or {}):
+        return "the model with the learned function"
     return {"unknown_at": "the nearest repair tried", "group": "the model with the leading rival"}.get(
         found["verdict"], "the repaired model"
     )
@@ -310,7 +391,7 @@ def _left(found, base, repaired, sketch, output):
         f"What {repair_words(found)} leaves",
         *headed(
             "By frequency and harmonic",
-            sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise"),
+            sketch(repaired, misfit.misfit_map, repaired, "misfit-after", f"Misfit of {repair_words(found)} over noise", base),
         ),
         *headed(
             f"Against {terms_in(repaired).field}, rate and frequency", sketch(repaired, misfit.against, repaired, "against-after")
@@ -398,14 +479,14 @@ def _models(found, evidence, sketch, drive):
     if repaired:
         yield section(
             sentence(repair_words(found)).rstrip("."),
-            part(text=sentence(repaired["message"])),
+            part(text=sentence(HERE.sub("", repaired["message"]))),
             *(
                 part(table=t)
                 for t in tables.parameters(repaired, validity(repaired)[3], f"Parameters of {repair_words(found)}", bounds_of(best))
             ),
             part(table=tables.correlations(repaired)),
             part(text=plane.never_switched(best)),
-            sketch(best, plane.mass_map, best),
+            sketch(best, plane.mass_map, best, doubt=_doubt(repaired)),
             sketch(best.get("inside"), loops.inside, best, drive),
             convergence_part(sketch, repaired),
         )
@@ -415,28 +496,31 @@ def _models(found, evidence, sketch, drive):
         plain_tables = tables.parameters(base, doubt, "Parameters of the plain model", bounds_of(evidence.get("base", {})))
         yield section(
             "A fit to them as they are (not to be used)" if spoilt else "The plain model",
-            part(text=sentence("" if spoilt else base["message"])),
+            part(text=sentence("" if spoilt else HERE.sub("", base["message"]))),
             *(part(table=t) for t in plain_tables[: 1 if repaired else 2]),
-            part(table=tables.recordings(base)),
+            part(table=tables.recordings(base, evidence.get("base"))),
             *(
                 []
                 if repaired
                 else [
                     part(text=plane.never_switched(best)),
-                    sketch(best, plane.mass_map, best),
+                    sketch(best, plane.mass_map, best, doubt=doubt),
                     sketch(best.get("inside"), loops.inside, best, drive),
                 ]
             ),
         )
 
 
-def _floors(found, output):
+def _floors(found, base, output):
     fine, unit = scale_of(output)[2:]
     meaning = {
-        "noise_rms": "noise between the harmonics", "solver_rms": "change of the simulation when its step is halved",
+        "noise_rms": "noise of one sample, from what lies between the harmonics", "solver_rms": "change of the simulation when its step is halved",
         "density_rms": "what a smooth density may leave",
     }  # fmt: skip
     rows = [
         [meaning.get(k, words(k)), f"{plain(fine * v)} {unit}"] for k, v in found["floors"].items() if isinstance(v, (int, float))
     ]
+    if base and rows:
+        noise = float((repeating(base)[1] ** 2).mean() ** 0.5)
+        rows.insert(1, ["noise of what repeats, in all harmonics of a recording", f"{plain(fine * noise)} {unit}"])
     return tables.table("The floors below which nothing is claimed", ["floor", "rms"], rows) if rows else None

@@ -40,6 +40,7 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
         "noise": noise,
         "chi2": np.array([r.chi2_per_sample for r in result.recordings]),
         "rms": np.array([np.sqrt(np.mean(r**2)) for r in residuals]),
+        "stroke": np.array([s.peak_to_peak for s in spectra]),
         "chosen": np.array(chosen),
         "loops": {str(k): _loop(spectra[k], misfit[k]) for k in chosen},
         "zoom": {str(k): _zoom(spectra[k], misfit[k]) for k in _extremes(result)[:2]},
@@ -218,6 +219,19 @@ def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict
             levelled = bench.output == "flux_density" or (own_zeros and key == "after")
             entry[key] = predicted - (predicted.mean() - measured.mean()) * levelled
         found[str(k)] = entry
+    return found
+
+
+def of_offender(shown) -> dict:
+    """The signal of a file that cannot be used, whole and about the place, thinned; `shown`: as a `RecordingError` holds it."""
+    values, first, length = np.asarray(shown["values"], float), shown["first"], shown["length"]
+    time = np.arange(len(values), dtype=float) if shown.get("time") is None else np.asarray(shown["time"], float)
+    found = {key: np.array(shown.get(key) or "") for key in ("name", "channel", "unit")}
+    found |= {"timed": np.array(shown.get("time") is not None), "span": time[[first, min(first + length, len(time)) - 1]] - time[0]}
+    near = np.arange(max(0, first - 2 * length), min(len(values), first + 3 * length))
+    for key, picked in (("whole", np.arange(len(values))), ("near", near)):
+        thin = picked[:: max(1, len(picked) // 1500)]
+        found[key] = {"time": time[thin] - time[0], "values": values[thin]}
     return found
 
 

@@ -2,14 +2,21 @@
 
 import json
 import re
+from pathlib import Path
 
 from . import loops, misfit, plane, tables
 from .page import Sketch, part, section
 from .style import plain, terms_in
 
+DEFINED = (
+    "χ²/N: the squared misfit of each harmonic of the reading over the variance of its noise, mean over all N numbers. It is 1 where only noise is "
+    "left; its root says how many times its noise the misfit is that repeats every period."
+)
 NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
+MICROMETRES = re.compile(r"(\d[\d.]*e-0[45]) m\b")
 BELOW_NOISE, AT_NOISE, FAR = 0.5, 1.1, 2.0  # chi2/N: noise overstated; the error bars hold; they mean nothing
 WORST_AT_NOISE = 1.6
+FEWEST_STEPS = 3  # that make a picture of how the fit went
 WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|[^\s'"])+""")  # of a command line
 FIT_ALONE = ("--cells", "--bootstrap", "--bootstrap-kind", "--profile", "--workers", "--scheduler", "--checkpoint")
 
@@ -18,8 +25,8 @@ def validity(fit) -> tuple[str, str, str, str]:
     """(tone, headline, advice, doubt about the error bars) of a fit; the doubt is a key of `tables.DOUBTS`."""
     chi2 = fit["chi2_per_sample"]
     bound = [n for n, p in fit["parameters"].items() if p["at_bound"]]
-    loose = [n for n, p in fit["parameters"].items() if p["free"] and not p["identified"]]
-    worst = max((r["chi2_per_sample"] for r in fit["recordings"]), default=chi2)
+    loose = [n for n, p in fit["parameters"].items() if p["free"] and not p["identified"] and not n.startswith(tables.LEARNED)]
+    worst = max(fit["recordings"], key=lambda r: r["chi2_per_sample"], default={"chi2_per_sample": chi2})
     ask = "Run the diagnosis on the same files; it says what physics is missing, and where."
     if not fit["converged"]:
         mend = "The options for it: --max-jacobians and --model."
@@ -28,13 +35,13 @@ def validity(fit) -> tuple[str, str, str, str]:
         mend = "Check the signs and units of the channels in the bench file."
         return "bad", "The misfit is not a number: these numbers are not a result", mend, "not valid"
     if chi2 > FAR:
-        return "bad", f"Error bars not valid: the residual is {plain(chi2**0.5, 2)} times the noise", ask, "not valid"
+        return "bad", f"Error bars not valid: what repeats is {plain(chi2**0.5, 2)} times its noise", ask, "not valid"
     if bound:
         mend = "A parameter at its bound takes the blame for something else; free another, or check the bench file."
         return "bad", f"At a bound: {', '.join(bound)}", mend, "not valid"
-    if chi2 > AT_NOISE or worst > WORST_AT_NOISE:
-        where = "" if chi2 > AT_NOISE else " in one recording"
-        return "warn", f"A little above the noise{where} (χ²/N = {plain(chi2)}): error bars are too narrow", ask, "too narrow"
+    if chi2 > AT_NOISE or worst["chi2_per_sample"] > WORST_AT_NOISE:
+        where, size = ("", chi2) if chi2 > AT_NOISE else (f" in {Path(worst['file']).name}", worst["chi2_per_sample"])
+        return "warn", f"A little above the noise{where} (χ²/N = {plain(size)}): error bars are too narrow", ask, "too narrow"
     if loose:
         mend = "These recordings do not determine it; record another range, or hold it fixed."
         return "warn", f"At the noise, but not identified: {', '.join(loose)}", mend, ""
@@ -57,15 +64,18 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
             *(part(table=t) for t in (*tables.parameters(fit, doubt, bounds=bounds_of(evidence)), *tables.intervals(fit))),
             part(table=tables.correlations(fit)),
         ),
-        section("Recordings", part(table=tables.recordings(fit))),
+        section("Recordings", part(table=tables.recordings(fit, evidence))),
         section(
             "Measured and fitted",
             part(heading="Check recordings", table=tables.checks(fit["check"], repaired=False)) if fit.get("check") else None,
+            sketch(evidence.get("checks"), loops.checks, evidence.get("checks"), output, drive, fit.get("check"), False),
             *headed("Loops", sketch(evidence, loops.loops, evidence, output, drive)),
             *headed("Zoom in time", sketch(evidence, loops.zoom, evidence, output)),
         ),
         residual_section(sketch, evidence, output),
-        section("The Preisach plane", part(text=plane.never_switched(evidence)), sketch(evidence, plane.mass_map, evidence)),
+        section(
+            "The Preisach plane", part(text=plane.never_switched(evidence)), sketch(evidence, plane.mass_map, evidence, doubt=doubt)
+        ),
         section("Inside the model", sketch(evidence.get("inside"), loops.inside, evidence, drive)),
         section("How the fit went", convergence_part(sketch, fit), part(table=tables.numbers(fit))),
     ]
@@ -74,7 +84,7 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
         advice = ""
     facts = f"Bench {fit['bench']}; {number} recording{'s' if number != 1 else ''}, {plain(span[0], 4)} to {plain(span[-1], 4)} Hz."
     return {
-        "title": f"Joint fit of {fit['bench']}", "facts": facts, "tone": tone, "headline": headline, "message": [sentence(fit["message"])],
+        "title": f"Joint fit of {fit['bench']}", "facts": facts, "tone": tone, "headline": headline, "message": [sentence(fit["message"])], "defined": DEFINED,
         "advice": advice, "command": command, "sections": [s for s in sections if s],
     }  # fmt: skip
 
@@ -131,15 +141,17 @@ def headed(heading, drawn) -> list:
 def convergence_part(sketch, fit):
     """How the objective fell, where the fit kept it."""
     steps = [s for s in fit.get("history", []) if s[2] is not None and s[2] > 0]
-    return sketch(steps, misfit.convergence, steps)
+    return sketch(steps if len(steps) >= FEWEST_STEPS else None, misfit.convergence, steps)
 
 
 def sentence(text: str) -> str:
     """A message with a capital (unless it begins with a name) and a full stop, its signs as people write them."""
+    text = re.sub(r"(?<=\d)%", "\u00a0%", text)
     text = text.strip().replace(" -> ", " → ").replace("chi2/N", "χ²/N").replace("= nan", "= not a number")
     if not text:
         return ""
     text = NANOMETRES.sub(lambda m: " → ".join(f"{1e9 * float(v):.3g}" for v in m.groups() if v) + " nm", text)
+    text = MICROMETRES.sub(lambda m: f"{1e6 * float(m[1]):.4g} µm", text)
     first = text.split()[0].rstrip(",:;.")
     return (text[0].upper() + text[1:] if first.isalpha() else text) + ("" if text.endswith((".", "?", "!")) else ".")
 

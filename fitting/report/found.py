@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from .style import BLUE, INK, MUTED, PALE, SKY, VERMILION, canvas, percent, picture, plain, scale_of, styled
+from .residuals import repeating
+from .style import BLUE, INK, MUTED, PALE, SKY, VERMILION, canvas, percent, picture, plain, scale_of, styled, words
 
 WIDTH = 10.0
 BLOCKS = ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sensor")
@@ -10,8 +11,8 @@ THRESHOLD = 5.5  # of |z|, as the search uses it
 
 
 def block_map(where, marks, drive: str, stem: str = "blocks"):
-    """The chain of blocks, each shaded by the share of the misfit that its best effect could explain; `marks`: block ->
-    what the verdict says of it."""
+    """The chain of blocks, each shaded by the share of what is above the noise that its best effect could explain; `marks`:
+    block -> what the verdict says of it."""
     shares = where["by_block"]
     shown = [b for b in BLOCKS if b in shares or b in marks]
     wide = 1.0 / max(len(shown), 1)
@@ -37,8 +38,8 @@ def block_map(where, marks, drive: str, stem: str = "blocks"):
                     arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 1},
                 )
         caption = (
-            f"The chain from {drive} to reading. The percentage is the share of the misfit that the best single effect of the block could take, to first "
-            "order; blocks overlap, so shares do not add up. A thick frame marks the blocks of which the verdict speaks."
+            f"The chain from {drive} to reading. The percentage is the share of what is above the noise that the best single effect of the block could "
+            "take, to first order; blocks overlap, so shares do not add up. A thick frame marks the blocks of which the verdict speaks."
         )
         words = ", ".join(f"{b} {percent(shares.get(b, 0.0))}" + (f" ({marks[b]})" if b in marks else "") for b in shown)
         return picture(figure, stem, "Block map: what each block could explain", caption, words)
@@ -55,20 +56,19 @@ def _box(left, width, tint, line):
 def places(where, evidence, output: str, stem: str = "places"):
     """Misfit by branch, by quarter of the field and by period, against what noise alone would leave."""
     fine, unit = scale_of(output)[2:]
-    floor = np.nan_to_num(evidence["lines"]["floor"], nan=0.0)
-    noise = fine * float(np.sqrt(np.mean(np.sum(0.5 * floor[:, 1:] ** 2, axis=1) + floor[:, 0] ** 2)))
+    noise = fine * float(np.sqrt(np.mean(repeating(evidence)[1] ** 2)))
     with styled():
         figure = canvas(WIDTH, 2.7)
         groups = (
             ("by branch", list(where["by_branch"]), list(where["by_branch"].values())),
             ("by part of the drive's range", ["lowest\nquarter", "second", "third", "highest\nquarter"], where["by_field"]),
         )
-        highest = 1.15 * max(noise, *(fine * max(v) for _, _, v in groups))
+        highest = 1.4 * max(noise, *(fine * max(v) for _, _, v in groups))
         for k, (title, names, values) in enumerate(groups):
             axes = figure.add_axes([0.07 + 0.33 * k, 0.2, 0.24, 0.7])
             axes.bar(range(len(values)), fine * np.asarray(values), color=SKY, ec=INK, lw=0.5, width=0.65)
-            axes.axhline(noise, color=INK, lw=1, ls=(0, (4, 2)))
-            axes.text(1.0, noise / highest, " noise", transform=axes.transAxes, ha="left", va="center", fontsize=7.5)
+            axes.axhline(noise, color=INK, lw=1, ls=(0, (4, 2)), label="noise of what repeats")
+            axes.legend(loc="upper right", borderaxespad=0)
             axes.set_xticks(range(len(values)), names)
             axes.set(title=title, ylim=(0, highest))
             if k == 0:
@@ -77,13 +77,14 @@ def places(where, evidence, output: str, stem: str = "places"):
         rows = where["by_period"]
         for row in rows:
             axes.plot(np.arange(1, len(row) + 1), fine * np.asarray(row), marker="o", ms=2.5, lw=0.8, color=BLUE, alpha=0.7)
-        axes.axhline(fine * float(np.median(evidence["noise"])), color=INK, lw=1, ls=(0, (4, 2)))
+        axes.axhline(fine * float(np.median(evidence["noise"])), color=INK, lw=1, ls=(0, (4, 2)), label="noise of a sample")
+        axes.legend(loc="lower right", borderaxespad=0.4)
         top = max((max(r) for r in rows), default=1.0)
         axes.set(title="by period (does not repeat)", xlabel="period", ylim=(0, 1.2 * fine * top))
         axes.xaxis.get_major_locator().set_params(integer=True)
         caption = (
             "Rms misfit of the plain model on rising and falling branches and near the turning points, in quarters of the drive's range, and, "
-            "right, what does not repeat from period to period, one line a recording. Dashed: what noise alone leaves."
+            "right, what does not repeat from period to period, one line a recording. Dashed: what noise alone leaves of each; of what repeats it leaves less."
         )
         words = ", ".join(f"{n} {plain(fine * v)} {unit}" for n, v in where["by_branch"].items())
         return picture(figure, stem, "Where in the loop the misfit sits", caption, words)
@@ -116,12 +117,12 @@ def ranking(candidates, stem: str = "ranking", count: int = 16):
                     va="center",
                     fontsize=7.5,
                 )
-        axes.set_yticks(range(len(rows)), [c["name"].replace("_", " ") for c in rows])
+        axes.set_yticks(range(len(rows)), [words(c["name"]) for c in rows])
         axes.set_ylim(-0.6, len(rows) - 0.4)
         axes.set_xlabel("score |z|, standard deviations")
         caption = (
             "Score of each effect on what the plain model leaves, off everything that the plain model can do itself (root scale). Dashed: the "
             f"threshold of {THRESHOLD}. Dark: fitted for real, with the fall of χ² that it achieved."
         )
-        lead = "; ".join(f"{c['name']} {plain(abs(c['z']))}" for c in candidates[:5])
+        lead = "; ".join(f"{words(c['name'])} {plain(abs(c['z']))}" for c in candidates[:5])
         return picture(figure, stem, "Ranking of the catalogue", caption, f"Leaders: {lead}.")

@@ -4,10 +4,11 @@ import numpy as np
 
 from . import tables
 from .page import part
-from .style import BLUE, GREEN, MUTED, PALE, VERMILION, canvas, percent, picture, plain, styled, unit_text
+from .style import BLUE, MUTED, PALE, canvas, per, percent, picture, plain, styled, unit_text
 
-SHOWN = 8  # boundaries of the table
-FINE = {"m": (1e9, "nm"), "A/m": (1.0, "A/m"), "A": (1e3, "mA"), "T": (1e3, "mT")}
+SHOWN = 8  # boundaries of the table, and any further one that was fitted
+FITTED = ("fitted jointly: χ²/N", "left out: χ²/N")
+UNITS = {"m": (1e6, "µm"), "m/s": (1e3, "mm/s"), "A/m": (1e-3, "kA/m"), "A": (1.0, "A"), "T": (1e3, "mT")}
 
 
 def parts(unknown, sketch) -> list:
@@ -38,75 +39,86 @@ def _joined(variables):
     return " and ".join(variables).replace(" and times_", ", times ").replace("_", " ")
 
 
+def in_units(unit: str) -> tuple[float, str]:
+    """(factor, unit) in which a quantity of the learned function is shown, the same in its table and its picture."""
+    return UNITS.get(unit, (1.0, unit_text(unit) or "1"))
+
+
 def _with_unit(value, unit):
-    factor, label = FINE.get(unit, (1.0, unit))
+    factor, label = in_units(unit)
     return f"{plain(factor * value)} {label}"
 
 
+def _place(boundary) -> tuple:
+    """What makes a boundary: its block and its variables."""
+    return boundary["block"], tuple(boundary["variables"])
+
+
+def _choice(boundary, unknown) -> str:
+    """What became of a boundary; "" where the folder does not say."""
+    if _place(boundary) == _place(unknown):
+        return "kept"
+    if _place(boundary) in map(_place, unknown["rivals"]):
+        return "not told from it"
+    return "" if "left_out" not in boundary else "not tried" if boundary["left_out"] is None else "tried, worse"
+
+
 def _boundaries(unknown):
-    rivals = {(r["block"], tuple(r["variables"])) for r in unknown["rivals"]}
+    boundaries, kept = unknown["boundaries"], _place(unknown)
+    told = any("left_out" in b for b in boundaries)  # a folder of before does not say which were tried
+    columns = [tables.aligned([[b.get(key)] for b in boundaries]) for key in ("chi2_per_sample", "left_out")]
     rows = []
-    for b in unknown["boundaries"][:SHOWN]:
-        place = (b["block"], tuple(b["variables"]))
-        kept = place == (unknown["block"], tuple(unknown["variables"]))
-        said = "kept" if kept else "not told from it" if place in rivals else ""
-        rows.append(
-            [
-                b["block"],
-                _joined(b["variables"]),
-                plain(b["evidence"]),
-                percent(b["share"]),
-                percent(b["visibility"]),
-                said,
-            ]
-        )
+    for rank, (b, chi2, left_out) in enumerate(zip(boundaries, *columns, strict=True)):
+        if rank < SHOWN or b.get("left_out") is not None or _place(b) == kept:
+            first_order = [b["block"], _joined(b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"])]
+            rows.append([*first_order, *((*chi2, *left_out) if told else ()), _choice(b, unknown)])
     note = (
-        "To first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit is with a smooth function there than "
-        "without. Visible: the part of it that density and constants cannot make."
+        "Evidence, share and visibility are to first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit "
+        "is with a smooth function there than without. Visible: the part of it that density and constants cannot make. The best by evidence "
+        "were fitted jointly with all else; what decides among these is the χ²/N of recordings left out one at a time, and of those that come near "
+        "each other there, which is more visible."
     )
-    head = ["block", "function of", "evidence", "share explained", "visible", "choice"]
+    head = ["block", "function of", "evidence", "share explained", "visible", *(FITTED if told else ()), "choice"]
     return part(table=tables.table("Where a smooth function would serve", head, rows, note))
 
 
 def learned_function(unknown, stem: str = "learned"):
-    """The function with its 95 % band over its first variable; the range seen is white, beyond it grey."""
+    """The function with its 95 % band over its first variable, a panel for each value of the second; the range seen is white,
+    beyond it grey."""
     x = np.asarray(unknown["function"]["x"])
-    unit = unknown["variable_units"][0]
-    fine = {"m": (1e6, "µm"), "m/s": (1e3, "mm/s"), "A/m": (1e-3, "kA/m")}
-    factor, label = fine.get(unit, (1.0, unit_text(unit) or "1"))
-    scale, output = FINE.get(unknown["unit"], (1.0, unknown["unit"]))
+    factor, label = in_units(unknown["variable_units"][0])
+    scale, output = in_units(unknown["unit"])
+    slices = unknown["function"]["slices"]
     seen = [factor * v for v in unknown["seen"][0]]
-    second = unknown["variables"][1].replace("_", " ") if len(unknown["variables"]) > 1 else ""
     inside = (x >= unknown["seen"][0][0]) & (x <= unknown["seen"][0][1])
-    ends = [
-        scale * f([f(np.asarray(s[k])[inside]) for s in unknown["function"]["slices"]])
-        for k, f in (("low", np.min), ("high", np.max))
-    ]
-    room = 0.6 * (ends[1] - ends[0])
+    ends = [scale * f([f(np.asarray(s[k])[inside]) for s in slices]) for k, f in (("low", np.min), ("high", np.max))]
+    room = 0.25 * (ends[1] - ends[0])
     with styled():
         figure = canvas(10.0, 2.8)
-        axes = figure.add_axes([0.085, 0.19, 0.86, 0.76])
-        for s, colour, dash in zip(
-            unknown["function"]["slices"], (BLUE, VERMILION, GREEN), ("-", (0, (5, 2)), (0, (1, 1))), strict=False
-        ):
-            name = "learned" if s["at"] is None else f"{second} {plain(s['at'])} {unit_text(unknown['variable_units'][1])}"
-            axes.fill_between(
-                factor * x, scale * np.asarray(s["low"]), scale * np.asarray(s["high"]), color=colour, alpha=0.18, lw=0
-            )
-            axes.plot(factor * x, scale * np.asarray(s["value"]), color=colour, ls=dash, label=name)
-        for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
-            axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
-        axes.axhline(0, color=MUTED, lw=0.5)
-        axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room))
-        axes.set(
-            xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {label}", ylabel=f"added at the {unknown['block']} / {output}"
-        )
-        if len(unknown["function"]["slices"]) > 1:
-            axes.legend(loc="best")
+        for k, s in enumerate(slices):
+            axes = figure.add_axes([0.075 + k * 0.92 / len(slices), 0.19, 0.92 / len(slices) - 0.045, 0.68])
+            axes.fill_between(factor * x, scale * np.asarray(s["low"]), scale * np.asarray(s["high"]), color=BLUE, alpha=0.18, lw=0)
+            axes.plot(factor * x, scale * np.asarray(s["value"]), color=BLUE)
+            for beyond in ((factor * x[0], seen[0]), (seen[1], factor * x[-1])):
+                axes.axvspan(*beyond, color=PALE, alpha=0.35, lw=0)
+            axes.axhline(0, color=MUTED, lw=0.5)
+            axes.set(xlim=(factor * x[0], factor * x[-1]), ylim=(ends[0] - room, ends[1] + room))
+            axes.set(xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {per(label)}", title=_slice(unknown, s))
+            if k == 0:
+                axes.set_ylabel(f"added at the {unknown['block']} / {per(output)}")
         caption = (
             f"Learned function: what the {unknown['block']} adds beside the model, with its 95 % interval, less its mean. Grey: beyond what the recordings "
             "reached, where it is held and its interval widens."
         )
-        middle = unknown["function"]["slices"][0]
+        middle = slices[0]
         words = f"From {plain(scale * middle['value'][0])} to {plain(scale * middle['value'][-1])} {output}."
         return picture(figure, stem, "Learned function", caption, words)
+
+
+def _slice(unknown, s) -> str:
+    """Where in the second variable a panel lies, "" where there is no second."""
+    if s["at"] is None:
+        return ""
+    factor, label = in_units(unknown["variable_units"][1])
+    name = unknown["variables"][1].removeprefix("times_").replace("_", " ")
+    return f"{name} {plain(factor * s['at'])} {label}"

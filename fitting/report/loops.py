@@ -10,6 +10,7 @@ from .style import (
     MEASURED,
     MODEL,
     MUTED,
+    ORANGE,
     PALE,
     SKY,
     VERMILION,
@@ -20,6 +21,7 @@ from .style import (
     plain,
     scale_of,
     styled,
+    unit_text,
 )
 
 COLUMNS = 3
@@ -129,17 +131,21 @@ def _loop(axes, loop, drive_factor, factor, heading):
         axes.plot(close(drive), factor * close(loop["after"]), color=INK, lw=0.8, label="after")
     axes.set_title(heading, loc="left", linespacing=1.3)
     axes.margins(0.04)
+    axes.locator_params(axis="x", nbins=5)
+    axes.locator_params(axis="y", nbins=6)
 
 
 def _strip(axes, loop, strips, fine):
-    phase, band = loop["phase"], 2 * fine * loop["noise"]
-    axes.fill_between(phase, -band, band, color=PALE, lw=0, label="twice the noise")
+    phase = loop["phase"]
+    band = 2 * fine * float(np.median(loop["noise"]))  # bins that do not divide the period hold one sample more or less
+    axes.axhspan(-band, band, color=PALE, lw=0, label="twice the noise")
     axes.axhline(0, color=MUTED, lw=0.5)
-    styles = {"model": {"color": MODEL, "lw": 0.9}, "after": {"color": INK, "lw": 0.9}}
+    below = {"lw": 2.6, "alpha": 0.45} if len(strips) > 1 else {"lw": 0.9}  # seen under the other
+    styles = {"model": {"color": MODEL, **below}, "after": {"color": INK, "lw": 0.8}}
     for key, _, values in strips:
         axes.plot(phase, fine * values, **styles[key])
     reach = max(np.max(np.abs(fine * values)) for _, _, values in strips)
-    reach = max(1.1 * reach, 1.6 * float(np.max(band)))
+    reach = max(1.1 * reach, 1.6 * band)
     axes.set(xlim=(0, 1), ylim=(-reach, reach))
     axes.locator_params(axis="y", nbins=3)
 
@@ -182,7 +188,7 @@ def zoom(evidence, output: str, stem: str = "zoom"):
 
 def inside(evidence, drive: str, stem: str = "inside"):
     """H, I_1 and M over a period, and M against H, of a few recordings."""
-    keys = list(evidence["inside"])
+    keys = sorted(evidence["inside"], key=lambda k: evidence["frequency"][int(k)])
     with_current = "I_1" in evidence["inside"][keys[0]]
     terms = terms_of(drive)
     rows = ["H", "I_1", "M", "loop"] if with_current else ["M", "loop"] if drive == "voltage" else ["H", "M", "loop"]
@@ -241,6 +247,33 @@ def _inside_row(axes, row, signals, terms, first):
     if row != "loop":
         axes.set_xlim(0, 1)
     axes.locator_params(axis="y", nbins=4)
+
+
+def offender(entry, stem: str = "offender"):
+    """The signal of a file that cannot be used: the whole of it, and about the place where it is at fault."""
+    channel, timed = str(entry["channel"]), bool(entry["timed"])
+    known = channel in ("displacement", "flux_density", "magnetization", "polarization")
+    factor, label = (
+        scale_of(channel)[:2] if known else (1.0, f"{channel.replace('_', ' ')} / {per(unit_text(str(entry['unit'])) or '1')}")
+    )
+    first, last = (1e3 if timed else 1.0) * np.asarray(entry["span"])
+    with styled():
+        figure = canvas(WIDTH, 2.6)
+        for k, (key, title) in enumerate((("whole", f"{entry['name']}, as recorded"), ("near", "about the place"))):
+            axes = figure.add_axes([0.07 + 0.49 * k, 0.2, 0.42, 0.68])
+            axes.axvspan(first, last, color=ORANGE, alpha=0.35, lw=0, label="here")
+            at = (1e3 if timed else 1.0) * entry[key]["time"]
+            axes.plot(at, factor * entry[key]["values"], color=BLUE, lw=1.0, marker="." if k else "", ms=2.5, mew=0)
+            axes.set(title=title, xlabel="time / ms" if timed else "sample", xlim=(at[0], at[-1]))
+            if k == 0:
+                axes.set_ylabel(label)
+                axes.legend(loc="best")
+        caption = (
+            "The signal for which the file cannot be used, as it was recorded, and the samples about the place, which is marked."
+        )
+        return picture(
+            figure, stem, "The signal at fault", caption, f"From {plain(first)} to {plain(last)} {'ms' if timed else 'samples'}."
+        )
 
 
 def periods(entries, stem: str = "periods"):

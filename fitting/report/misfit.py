@@ -28,9 +28,22 @@ WIDTH = 10.0
 MARKERS = "os^Dv<>P"
 
 
-def misfit_map(evidence, stem: str = "misfit", title: str = "Misfit over noise by frequency and harmonic"):
-    """Amplitude of the misfit over the noise of its line, recordings by frequency down, harmonics across."""
-    ratio = evidence["lines"]["misfit"] / evidence["lines"]["floor"]
+def row_labels(evidence, order) -> list[str]:
+    """What to call the recordings in `order`: by frequency, and by file too where others have the same."""
+    texts = [f"{plain(evidence['frequency'][k], 4)} Hz" for k in order]
+    named = [f"{str(evidence['name'][k])[-20:]}, {text}" for k, text in zip(order, texts, strict=True)]
+    return [name if texts.count(text) > 1 else text for name, text in zip(named, texts, strict=True)]
+
+
+def _over_noise(evidence) -> np.ndarray:
+    """Misfit of every line over its noise, nan where it has none."""
+    return evidence["lines"]["misfit"] / evidence["lines"]["floor"]
+
+
+def misfit_map(evidence, stem: str = "misfit", title: str = "Misfit over noise by frequency and harmonic", beside=None):
+    """Amplitude of the misfit over the noise of its line, recordings by frequency down, harmonics across; `beside`: evidence of
+    another model, whose map has the same colours."""
+    ratio = _over_noise(evidence)
     order = np.argsort(evidence["frequency"], kind="stable")
     shown = np.log10(np.maximum(np.where(np.isfinite(ratio), ratio, 0.0), 0.3))[order]
     R, H = shown.shape
@@ -39,11 +52,10 @@ def misfit_map(evidence, stem: str = "misfit", title: str = "Misfit over noise b
     with styled():
         figure = canvas(WIDTH, height)
         axes = figure.add_axes([0.16, 0.62 / height, 0.70, 1 - 0.67 / height])
-        top = max(1.0, float(shown.max()))
+        top = max(1.0, float(shown.max()), *(float(np.log10(np.nanmax(_over_noise(e)))) for e in (beside,) if e))
         drawn = axes.imshow(shown, aspect="auto", cmap=SEQUENTIAL, vmin=np.log10(0.3), vmax=top, interpolation="nearest")
         step = max(1, R // 24)
-        labels = [f"{plain(evidence['frequency'][k], 4)} Hz" for k in order]
-        axes.set_yticks(range(0, R, step), labels[::step])
+        axes.set_yticks(range(0, R, step), row_labels(evidence, order)[::step])
         axes.set_xlabel("harmonic of the drive (0: mean)")
         bar = figure.colorbar(drawn, cax=figure.add_axes([0.875, 0.62 / height, 0.012, 1 - 0.67 / height]))
         ticks = [t for t in (-0.5, 0, 0.5, 1, 1.5, 2, 2.5, 3, 4) if np.log10(0.3) <= t <= top]
@@ -67,7 +79,7 @@ def traces(evidence, stem: str = "traces"):
             at = evidence["trace"][str(k)]["periods"]
             axes.axhspan(-row * spacing - 2, -row * spacing + 2, color=PALE, lw=0, alpha=0.7)
             axes.plot(at, value - row * spacing, color=BLUE if row % 2 == 0 else INK, lw=0.7)
-        axes.set_yticks([-r * spacing for r in range(len(chosen))], [f"{plain(evidence['frequency'][k], 4)} Hz" for k in chosen])
+        axes.set_yticks([-r * spacing for r in range(len(chosen))], row_labels(evidence, chosen))
         axes.set_xlabel("time / periods of the drive")
         axes.set_xlim(0, max(evidence["trace"][str(k)]["periods"][-1] for k in chosen))
         top = max(0.6 * spacing, max(float(v.max()) - r * spacing for r, v in enumerate(values)) + 1)
@@ -87,8 +99,12 @@ def against(evidence, stem: str = "against"):
     with styled():
         figure = canvas(WIDTH, 2.9)
         axes = [figure.add_axes([0.065 + k / 3, 0.18, 0.255, 0.72]) for k in range(3)]
+        rows = [evidence["against"][key][name] for key in ("field", "rate") for name in ("rising", "falling")]
+        reach = 1.15 * max(float(np.nanmax(np.abs(row[0]) + 2 * row[1])) for row in rows)
         for ax, key in zip(axes, ("field", "rate"), strict=False):
             _branches(ax, evidence["against"][key], key, terms)
+            ax.set_ylim(-reach, reach)
+        inner = float(np.nanmedian(np.concatenate([0.5 * (row[3] - row[2]) for row in rows])))
         axes[0].legend(loc="best", handlelength=1.6)
         axes[0].set_ylabel("residual / noise of a sample")
         frequency, chi2 = evidence["frequency"], evidence["chi2"]
@@ -106,7 +122,7 @@ def against(evidence, stem: str = "against"):
         axes[0].set_title(f"against the {terms.applied}")
         axes[1].set_title("against its rate of change")
         caption = (
-            "Means of the residual with two standard errors, rising and falling branch apart; the grey band holds 90 % of the samples. "
+            f"Means of the residual with two standard errors, rising and falling branch apart; of single samples 90 % lie within ± {plain(inner, 2)}. "
             "Right: misfit of each recording against its frequency; the band is where noise alone would put it."
         )
         return picture(figure, stem, f"Residual against {terms.field}, rate and frequency", caption)
@@ -116,9 +132,6 @@ def _branches(axes, found, key, terms):
     edges = found["edges"]
     middle = 0.5 * (edges[1:] + edges[:-1]) if key == "field" else np.sqrt(edges[1:] * edges[:-1])
     scale, unit = terms.scaled(np.abs(edges).max() if key == "field" else 0.0)
-    low, high = np.fmin(found["rising"][2], found["falling"][2]), np.fmax(found["rising"][3], found["falling"][3])
-    keep = np.isfinite(low)
-    axes.fill_between(scale * middle[keep], low[keep], high[keep], color=PALE, lw=0, alpha=0.6)
     axes.axhline(0, color=MUTED, lw=0.5)
     for name, colour, marker in (("rising", BLUE, "o"), ("falling", VERMILION, "s")):
         mean, error = found[name][:2]
@@ -156,7 +169,7 @@ def autocorrelation(evidence, stem: str = "autocorrelation"):
     """Autocorrelation of the residual and of the noise alone, with the band of white noise."""
     found = evidence["autocorrelation"]
     band = float(found["band"])
-    outside = float(np.mean(np.abs(found["residual"]) > band))
+    outside, alone = (plain(100 * float(np.mean(np.abs(found[key]) > band)), 2) for key in ("residual", "noise"))
     with styled():
         figure = canvas(WIDTH, 2.5)
         axes = figure.add_axes([0.08, 0.2, 0.88, 0.77])
@@ -168,8 +181,9 @@ def autocorrelation(evidence, stem: str = "autocorrelation"):
         axes.set(xlabel="lag / periods of the drive", ylabel="autocorrelation", xlim=(0, found["lag"][-1]), ylim=(-reach, reach))
         axes.legend(loc="upper right", ncols=2)
         caption = (
-            f"Autocorrelation of the residual, mean over the recordings. The band holds 95 % of white noise; {plain(100 * outside, 2)} % of the lags "
-            "lie outside it. A peak at whole periods is a misfit that repeats with the drive."
+            f"Autocorrelation of the residual, mean over the recordings. The band holds 95 % of white noise. Outside it lie {outside} % of the lags of the "
+            f"residual, and {alone} % of those of the noise alone, which need not be white: what the two lines share is the noise. A peak at whole periods "
+            "that the noise does not have is a misfit that repeats with the drive."
         )
         return picture(figure, stem, "Autocorrelation of the residual", caption)
 

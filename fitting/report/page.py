@@ -1,6 +1,7 @@
 """From a result folder to report.html: one file, offline, without script. JSON and report.npz are all that it reads."""
 
 import json
+import re
 import zipfile
 from pathlib import Path
 
@@ -64,11 +65,21 @@ def render(target: Path, page: dict, reproduce: str, versions: str = "", source:
         for picture in pictures:
             write_atomically(shapes / f"{picture.stem}.svg", '<?xml version="1.0" encoding="utf-8"?>\n' + picture.svg)
             write_atomically(shapes / f"{picture.stem}.png", picture.png)
-    template = Environment(autoescape=True, trim_blocks=True).from_string(TEMPLATE.read_text(encoding="utf-8"))
-    words = {"advice": "", "command": "", **page, "reproduce": reproduce, "versions": versions}
+    environment = Environment(autoescape=True, trim_blocks=True)
+    environment.filters["kept_together"] = kept_together
+    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+    words = {"advice": "", "command": "", "defined": "", **page, "reproduce": reproduce, "versions": versions}
     text = template.render(**words, source=source or target.with_suffix(".json").name, drawn=bool(pictures))
     write_atomically(target, text)
     return target
+
+
+UNIT = re.compile(r"(?<=[\d∞]) (?=(?!(?:to|in|of|and|not|from|by|strong)\b)[%°µ√A-Za-z]|1/)| (?=± )|(?<=±) ")
+
+
+def kept_together(text: str) -> str:
+    """A text whose numbers do not part from their units and errors where the line ends."""
+    return UNIT.sub("\u00a0", text)
 
 
 def section(title: str, *parts) -> dict | None:

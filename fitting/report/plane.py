@@ -18,8 +18,8 @@ def never_switched(evidence) -> str:
     return f"{blind} of {count} cells {'was' if blind == 1 else 'were'} never switched by any recording: their masses rest on smoothness alone."
 
 
-def mass_map(evidence, stem: str = "masses"):
-    """Masses (left) and their standard errors (right) over beta and alpha."""
+def mass_map(evidence, stem: str = "masses", doubt: str = ""):
+    """Masses (left) and their standard errors (right) over beta and alpha; `doubt`: what is wrong with the errors, if anything."""
     found = evidence["plane"]
     lower = np.tril(np.ones(found["masses"].shape, bool))
     seen = found["seen"].astype(bool) & lower
@@ -46,7 +46,7 @@ def mass_map(evidence, stem: str = "masses"):
             )
         )
         if known:
-            caption += f" Of the switched mass {percent(well)} is in cells whose standard error is below 30 %."
+            caption += f" Of the switched mass {percent(well)} is in cells whose standard error is below 30 %{f' (errors {doubt})' if doubt else ''}."
         return picture(figure, stem, "Preisach masses and their standard errors", caption)
 
 

@@ -19,6 +19,21 @@ def by_phase(s, signal, bins: int):
     return phase[keep], mean[keep], count[keep]
 
 
+def repeating(evidence) -> tuple[np.ndarray, np.ndarray]:
+    """Rms of the misfit that repeats every period and of its noise, one each a recording, unit of the reading."""
+    amplitudes = (np.nan_to_num(evidence["lines"][key], nan=0.0) for key in ("misfit", "floor"))
+    misfit, noise = (np.sqrt(a[:, 0] ** 2 + 0.5 * np.sum(a[:, 1:] ** 2, axis=1)) for a in amplitudes)
+    return misfit, noise
+
+
+def strokes(evidence) -> np.ndarray:
+    """Peak to peak of each reading; of evidence that does not hold it, where a loop was kept, else nan."""
+    if "stroke" in evidence:
+        return np.asarray(evidence["stroke"])
+    loops = evidence["loops"]
+    return np.array([np.ptp(loops[str(k)]["measured"]) if str(k) in loops else np.nan for k in range(len(evidence["name"]))])
+
+
 def traces(spectra, scaled) -> dict:
     """The residual over its noise along each record, block means times the root of the block: unit variance if white."""
     found = {}

@@ -104,9 +104,26 @@ def percent(share: float) -> str:
     return "0 %" if share <= 0 else "< 1 %" if share < 0.01 else "> 99 %" if 0.99 < share < 1 else f"{100 * share:.0f} %"
 
 
+SPOKEN = {
+    "delta_e": "ΔE effect",
+    "duffing_stiffness": "Duffing stiffness",
+    "coulomb_friction": "Coulomb friction",
+    "learned_term": "the learned function",
+}
+
+
+def words(name: str) -> str:
+    """An effect's name as people say it."""
+    return SPOKEN.get(name, name.replace("_", " "))
+
+
 def unit_text(unit: str) -> str:
-    """A unit with raised exponents; nothing for a number."""
-    return "" if unit == "1" else unit.replace("^0.5", "^½").replace("^2", "²").replace("^3", "³").replace("^-1", "⁻¹")
+    """A unit with raised exponents and roots; nothing for a number."""
+    return (
+        ""
+        if unit == "1"
+        else re.sub(r"(\([^()]*\)|\w+)\^0\.5", r"√\1", unit).replace("^2", "²").replace("^3", "³").replace("^-1", "⁻¹")
+    )
 
 
 def to_png(figure: Figure) -> bytes:

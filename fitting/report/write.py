@@ -6,6 +6,8 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
+
 from magjax.terms import MAGNETIC
 
 from ..result import write_atomically, write_model
@@ -13,8 +15,11 @@ from . import store
 from .page import rebuild
 
 
-def write_fit(folder: Path, result, recordings, content: dict, reproduce: str, progress=None) -> None:
-    """Write fit.json, model.json, report.npz, figures and report.html of a fit. `progress(text)` at every step."""
+def write_fit(folder: Path, result, recordings, content: dict, reproduce: str, progress=None, checks=()) -> None:
+    """Write fit.json, model.json, report.npz, figures and report.html of a fit.
+
+    `progress(text)` at every step; `checks`: the check recordings, drawn.
+    """
     from . import evidence
 
     folder = Path(folder)
@@ -22,14 +27,20 @@ def write_fit(folder: Path, result, recordings, content: dict, reproduce: str, p
     write_atomically(folder / "fit.json", json.dumps(content, indent=1))
     write_model(folder, result.actuator, result.bench)
     _say(progress, "report: signals")
-    store.save(folder, {**evidence.of_fit(result), "drive": result.bench.drive})
+    found = {**evidence.of_fit(result), "drive": result.bench.drive}
+    if checks:
+        found["checks"] = evidence.of_checks(result.actuator, result.actuator, checks, result.bench)
+    store.save(folder, found)
     rebuild(folder, progress)
 
 
-def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduce: str, checks=(), progress=None) -> None:
+def write_diagnosis(
+    folder: Path, diagnosis, recordings, content: dict, reproduce: str, checks=(), progress=None, bench=None, shown=None
+) -> None:
     """Write diagnosis.json, the repaired model, report.npz, figures and report.html of a diagnosis.
 
-    `checks`: the check recordings, drawn before and after; `progress(text)` at every step.
+    `checks`: the check recordings, drawn before and after; `progress(text)` at every step; `bench`: where no fit tells it;
+    `shown`: where a file is at fault, as a `RecordingError` holds it.
     """
     from . import evidence
 
@@ -46,6 +57,8 @@ def write_diagnosis(folder: Path, diagnosis, recordings, content: dict, reproduc
     if diagnosis.verdict == "data_problem" or (base is not None and not math.isfinite(base.chi2_per_sample)):
         named_first = sorted(recordings, key=lambda r: r.name not in diagnosis.message)
         found["recordings"] = evidence.of_recordings(named_first)
+        found |= {"bench": np.array(bench.name)} if bench else {}
+        found |= {"offender": evidence.of_offender(shown)} if shown else {}
     elif base is not None:
         found["base"] = evidence.of_fit(base, inside=repaired is None)
         found["catalogue"] = json.dumps(catalogue(base.bench.terms))

@@ -14,7 +14,7 @@ from ..param import param
 class Coil(eqx.Module):
     """A coil of N_m turns around a rod of cross-section A_m with eddy resistance R_eddy (T&B Fig. 4)."""
 
-    R_eddy: Float[Array, ""] = param(70.0, "ohm", "eddy-current resistance (3)", low=0.0, scale=70.0, typical=(1.0, 1000.0))
+    R_eddy: Float[Array, ""] = param(70.0, "ohm", "eddy-current resistance, T&B (3)", low=0.0, scale=70.0, typical=(1.0, 1000.0))
     c0: Float[Array, ""] = param(1.54e4, "1/m", "coil factor, field per current", low=0.0, typical=(1e3, 1e5))
     H_bias: Float[Array, ""] = param(1.23e4, "A/m", "bias field of the permanent magnet", scale=1e4, typical=(0.0, 5e4))
     N_m: Float[Array, ""] = param(1300.0, "1", "number of turns", low=0.0, typical=(50.0, 5000.0))

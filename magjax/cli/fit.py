@@ -111,7 +111,7 @@ def run_fit(arguments) -> int:
         if folder:
             from fitting.report import write_fit
 
-            write_fit(folder, result, recordings, content, _reproduce("fit", arguments), progress)
+            write_fit(folder, result, recordings, content, _reproduce("fit", arguments), progress, checks)
     if options.json:
         print(as_json(content))
     else:
@@ -151,7 +151,7 @@ def run_diagnose(arguments) -> int:
     check_placebo(options)
     prepare_jax()
     from magjax.errors import RecordingError
-    from magjax.readers import load_calibrations, load_checks, load_recordings
+    from magjax.readers import load_calibrations, load_checks, load_sound
 
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
@@ -159,12 +159,15 @@ def run_diagnose(arguments) -> int:
         if options.placebo:
             raise ConfigurationError("--placebo simulates recordings, and strain curves have a law instead; leave it out")
         return _diagnose_strain(options, bench, folder)
-    from fitting.diagnose import Diagnosis, diagnose
+    from fitting.diagnose import diagnose
     from fitting.setup import Choices
+    from fitting.verdict import unusable
 
-    recordings, checks, stopped = [], [], None
+    recordings, checks, stopped, shown = [], [], None, None
     try:
-        recordings = load_recordings(options.recordings, bench)
+        recordings, errors = load_sound(options.recordings, bench)
+        if errors:
+            raise errors[0]
         checks, refused = load_checks(options.check, bench)
         with Progress(options.quiet) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
@@ -175,19 +178,20 @@ def run_diagnose(arguments) -> int:
                 except (MagjaxError, KeyboardInterrupt) as error:  # the diagnosis itself is done and is kept
                     stopped = error
     except RecordingError as error:
-        found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
+        found, shown = unusable(errors or [error], recordings if errors else ()), error.shown
     content = found.as_dict()
     if folder:
         from fitting.report import write_diagnosis
 
         with Progress(options.quiet) as progress:
-            write_diagnosis(folder, found, recordings, content, _reproduce("diagnose", arguments), checks, progress)
+            write_diagnosis(folder, found, recordings, content, _reproduce("diagnose", arguments), checks, progress, bench, shown)
     if options.json:
         print(as_json(content))
     else:
         print(found)
         for row in found.candidates[:8]:
-            print(f"  {row.name:26s} z = {row.z:8.1f}   visible from {row.smallest_visible:.3g}")
+            seen = f"visible from {row.smallest_visible:.3g}" if row.tried_at is None else f"tried at {row.tried_at:.3g}"
+            print(f"  {row.name:26s} z = {row.z:8.1f}   {seen}")
         if found.placebo:
             print(placebo_text(found.placebo))
         if folder:

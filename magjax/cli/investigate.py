@@ -52,24 +52,34 @@ def analysis(bench, folder, options, live):
     def analyse(files, checks, number):
         live.tell("reading and compiling")
         prepare_jax()
-        from fitting.diagnose import Diagnosis, diagnose
+        from fitting.diagnose import diagnose
         from fitting.report import write_diagnosis
+        from fitting.verdict import unusable
         from magjax.errors import RecordingError
-        from magjax.readers import load_checks, load_recordings
+        from magjax.readers import load_checks, load_sound
 
         from .runtime import output_folder
 
-        recordings, held = [], []
+        recordings, held, shown = [], [], None
         try:
-            recordings = load_recordings(files, bench)
+            recordings, errors = load_sound(files, bench)
+            if errors:
+                raise errors[0]
             held, refused = load_checks(checks, bench)
             found = diagnose(recordings, bench, check=held, progress=progress).without_checks(refused)
         except RecordingError as error:
-            found = Diagnosis("data_problem", f"{error}.", data_problem=str(error))
+            found, shown = unusable(errors or [error], recordings if errors else ()), error.shown
         content = found.as_dict()
         place = output_folder(folder / f"diagnosis_{number + 1}")
         write_diagnosis(
-            place, found, recordings, content, f"magjax diagnose {' '.join(str(f) for f in files)} --bench {options.bench}", held
+            place,
+            found,
+            recordings,
+            content,
+            f"magjax diagnose {' '.join(str(f) for f in files)} --bench {options.bench}",
+            held,
+            bench=bench,
+            shown=shown,
         )
         return json.loads(json.dumps(content))
 

@@ -133,8 +133,9 @@ def test_a_converter_that_hangs_is_told(bits):
     assert stuck_stretch(x) is None
     x[1100:1140] = x[1100]
     assert stuck_stretch(x) == (1100, 40)
-    with pytest.raises(RecordingError, match="stands still at .* for 40 samples from sample 1100"):
+    with pytest.raises(RecordingError, match="stands still at .* m for 40 samples from sample 1100") as error:
         refuse_clipping("run.csv", "displacement", x)
+    assert (error.value.shown["first"], error.value.shown["length"]) == (1100, 40)
 
 
 @pytest.mark.parametrize("step, levels", [(15, [0, 15, 29, 44, 58, 73]), (3, [0, 9, 12, 21, 30]), (1, range(200))])
@@ -169,7 +170,7 @@ def test_a_clipped_emf_is_seen_before_it_is_integrated(tmp_path, merge):
         bench = dataclasses.replace(bench, columns={**bench.columns, "time": {"split": "capture", "merge": True}})
     (recording,) = load_recordings([emf_file(tmp_path, emf, **more)], bench)
     assert np.ptp(recording.channels["flux_density"]) > 0.1
-    with pytest.raises(RecordingError, match=r"emf of flux_density is clipped at its highest value 0.08") as error:
+    with pytest.raises(RecordingError, match=r"emf of flux_density is clipped at its highest value 0.08 V for") as error:
         load_recordings([emf_file(tmp_path, np.minimum(emf, 0.08), **more)], bench)
     assert "\n" not in str(error.value) and ("capture=0" in str(error.value)) == merge
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import Diagnosis
 from fitting.fit import fit
@@ -123,8 +124,9 @@ def folders(tmp_path_factory, runs, fitted, poor, diagnoses):
         made[kind] = folder = tmp_path_factory.mktemp(kind)
         content = result.as_dict()
         if kind in ("fit", "poor"):
-            content["check"] = []
-            write_fit(folder, result, recordings, content, "magjax fit rec_*.csv --bench aa-050h --out result")
+            held = checks if kind == "fit" else []
+            content["check"] = check_errors(result.actuator, result.actuator, held, result.bench)
+            write_fit(folder, result, recordings, content, "magjax fit rec_*.csv --bench aa-050h --out result", checks=held)
         else:
             known = recordings if kind != "unreadable" else []
             write_diagnosis(

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from fitting.fit import RESTS
-from fitting.report.misfit import STAGES, convergence, stages_of
+from fitting.report.misfit import STAGES, against, convergence, misfit_map, row_labels, stages_of
+from fitting.report.misfit import autocorrelation as drawn_autocorrelation
 from fitting.report.residuals import autocorrelation, by_field_and_rate, by_phase, traces
 
 
@@ -98,3 +99,38 @@ def test_a_convergence_panel_counts_each_stage_by_itself_and_keeps_its_legend_of
     assert ticks == list(range(1, 8))
     (legend,) = re.findall(r'x="([\d.]+)"[^>]*>from negative saturation<', svg)
     assert float(legend) > 0.72 * 720  # where the axes end, points
+
+
+def lines_of(ratio, frequencies):
+    """Evidence of recordings whose every line is met to `ratio` times its noise."""
+    return {
+        "frequency": np.array(frequencies), "name": np.array([f"rec_{k}.csv" for k in range(len(frequencies))]),
+        "lines": {"misfit": np.full((len(frequencies), 5), float(ratio)), "floor": np.ones((len(frequencies), 5))},
+    }  # fmt: skip
+
+
+def test_rows_of_one_frequency_are_told_apart_by_their_files():
+    assert row_labels(lines_of(1.0, [24.0, 8.0, 24.0]), [1, 0, 2]) == ["8 Hz", "rec_0.csv, 24 Hz", "rec_2.csv, 24 Hz"]
+
+
+def test_maps_before_and_after_have_the_same_colours():
+    before, after = lines_of(300.0, [8.0]), lines_of(2.0, [8.0])
+    ticks = [re.findall(r">([\d.]+)</text>", misfit_map(e, beside=b).svg)[-4:] for e, b in ((before, after), (after, before), (after, None))]  # fmt: skip
+    assert ticks[0] == ticks[1] != ticks[2]
+
+
+def test_the_autocorrelation_of_noise_is_no_alarm():
+    found = {"lag": np.arange(1, 11) / 10, "band": np.array(0.1), "residual": np.array([0.2] * 4 + [0.0] * 6), "noise": np.array([0.2] * 5 + [0.0] * 5)}  # fmt: skip
+    caption = drawn_autocorrelation({"autocorrelation": found}).caption
+    assert "lie 40 % of the lags of the residual, and 50 % of those of the noise alone" in caption
+
+
+def test_means_are_drawn_to_their_own_scale():
+    rows = np.array([np.full(8, 0.1), np.full(8, 0.02), np.full(8, -1.6), np.full(8, 1.6)])
+    branch = {"rising": rows, "falling": rows}
+    evidence = lines_of(1.0, [8.0, 20.0]) | {
+        "chi2": np.array([1.0, 1.1]),
+        "against": {"field": {"edges": np.linspace(0, 1e4, 9), **branch}, "rate": {"edges": np.geomspace(1, 1e4, 9), **branch}},
+    }
+    picture = against(evidence)
+    assert "90 % lie within ± 1.6" in picture.caption and ">1.5</text>" not in picture.svg and ">0.10</text>" in picture.svg

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from fitting.report import style
-from fitting.report.style import percent, plain, short_path, to_svg
-from fitting.report.tables import correlations, to_error
+from fitting.report.page import kept_together
+from fitting.report.style import percent, plain, short_path, to_svg, unit_text, words
+from fitting.report.tables import aligned, checks, correlations, table, to_error
 
 
 def test_numbers_as_people_write_them():
@@ -90,3 +91,35 @@ def test_correlations_mark_the_strong():
     made = correlations({"correlations": {"a~b": 0.95, "a~c": -0.2, "b~c": 0.0}})
     assert made["rows"][0] == ["a", "1.00", "0.95 strong", "−0.20"] and "strong" in made["note"]
     assert correlations({"correlations": {}}) is None
+
+
+def test_numbers_of_a_column_have_the_same_decimals_and_stand_to_the_right():
+    assert aligned([[46.8], [0.6], [48.0]]) == [["46.8"], ["0.6"], ["48.0"]]
+    assert aligned([[0.9, 1.4], [None, 2.326]]) == [["0.90", "1.40"], ["–", "2.33"]]
+    assert aligned([[16.4], [0.78]], least=2) == [["16.40"], ["0.78"]]
+    assert aligned([[5e-5], [2.0]]) == [["5e−5"], ["2"]]  # too far apart
+    rows = [["a", "43.2 nm", "2.9 to 3.1", "−1.2e−5 m s/A", "creep", "b = 2"], ["b", "–", "1 to 2", "", "1 drift", "not fitted"]]
+    assert table("", "abcdef", rows)["right"] == [False, True, False, True, False, False]
+    assert table("", ["question", "answer"], [["x", "1"]])["right"] == [False, False]
+
+
+def test_what_belongs_together_is_not_parted():
+    assert kept_together("43.2 nm") == "43.2\u00a0nm" and kept_together("< 1 %").endswith("1\u00a0%")
+    assert kept_together("b = 2 ± 0.1") == "b = 2\u00a0±\u00a00.1" and kept_together("0.8 1/A") == "0.8\u00a01/A"
+    assert kept_together("29.4 to 32.2") == "29.4 to 32.2"
+
+
+def test_names_and_units_as_people_write_them():
+    assert [words(n) for n in ("delta_e", "duffing_stiffness", "coulomb_friction", "second_mode")] == [
+        "ΔE effect",
+        "Duffing stiffness",
+        "Coulomb friction",
+        "second mode",
+    ]
+    assert unit_text("A/m (s/T)^0.5") == "A/m √(s/T)" and unit_text("m^2") == "m²"
+
+
+def test_the_error_beyond_the_noise_has_its_formula():
+    row = {"file": "c.csv", "unit": "m", "rms_before": 5e-8, "rms_after": 3e-8, "noise_rms": 4e-8, "beyond_plane": 0.0}
+    made = checks([row])
+    assert made["rows"] == [["c.csv", "50.0", "30.0", "40.0", "30.0", "0.0", "nm"]] and "√(rms error² − noise rms²)" in made["note"]
