@@ -13,6 +13,7 @@ from .together import together
 from .verdict import FULL_SHARE, HALF, NULL_CHI2, ROUGH_CHI2, Z_THRESHOLD, Evidence, misfit, too_little
 
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
+CLEAR_Z = 20.0  # the score of an effect that no density imitates: on nulls at chi2/N of 3 the highest are 6 to 7
 CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
 CELLS_ALONE, CELLS_LEAVE = 0.9, 1.45  # the same where they are to explain a misfit alone, and the chi2/N that they must come below
 VERY_ROUGH_CHI2 = 6.0  # chi2/N that a density may leave where the scores tell nothing
@@ -36,8 +37,8 @@ def _tells_nothing(evidence) -> bool:
 
 def is_rough(evidence, checks) -> bool:
     """Whether what is left is the density's: little, and nothing scores beyond what a rough one leaves and nothing earned its
-    place; or a finer density was asked for and what is named foretells the check recordings, which took no part
-    (without any, it must explain all but a little).
+    place; or what earned it is clear of any density; or a finer density was asked for and what is named foretells the check
+    recordings, which took no part (without any, it must explain all but a little).
 
     A smooth function could always be learned from it, and would be no physics.
     """
@@ -48,6 +49,8 @@ def is_rough(evidence, checks) -> bool:
         return False
     if too_little(evidence.reached, evidence.plain):
         return True
+    if _clear(evidence):
+        return True
     choices = current.choices
     finer = choices.knots[0] > Choices().knots[0] if choices.knots is not None else choices.rest != "held"
     if not checks:
@@ -55,6 +58,15 @@ def is_rough(evidence, checks) -> bool:
     before, after = ([misfit([row], which) for row in checks] for which in ("rms_before", "rms_after"))
     left = [a / b for a, b in zip(after, before, strict=True) if b > 1]  # of those that leave something to foretell
     return finer and sum(before) > len(checks) and sum(after) < FORETOLD * sum(before) and bool(np.median(left) < FORETOLD)
+
+
+def _clear(evidence) -> bool:
+    """Whether what was found scored far beyond what a rough density ever leaves, takes most of a misfit that one may leave, and
+    leaves nothing that scores beyond that."""
+    first = evidence.reached.steps[0][0].candidate
+    if abs(first.z) < CLEAR_Z or evidence.share < HALF or evidence.plain.chi2_per_sample > REFINE_BELOW:
+        return False
+    return _highest_beside(evidence.reached.current) < SECOND_Z
 
 
 def on_cells_alone(task, evidence) -> Evidence | None:
@@ -101,21 +113,21 @@ def beside_cells(task, evidence) -> Evidence | None:
         return None
     if len(reached.steps) == 1:  # of rivals those that leave nothing that scores
         _, tied, good, _ = reached.steps[0]
-        tied = [t for t in tied if _highest_beside(task, t.result) < SECOND_Z]
+        tied = [t for t in tied if _highest_beside(t.result) < SECOND_Z]
         if not tied:
             return None
         reached = dataclasses.replace(reached, current=tied[0].result, steps=[(tied[0], tied, good, cells)])
     taken = chi2_of(cells) - chi2_of(reached.current)
     if taken < max(MIN_DROP, HALF * excess_of(cells, NULL_CHI2), HALF * first.candidate.z**2):
         return None
-    if _highest_beside(task, reached.current) > Z_THRESHOLD:
+    if _highest_beside(reached.current) > Z_THRESHOLD:
         return None
     return dataclasses.replace(evidence, reached=reached, raw=cells, plain=cells, candidates=tuple(candidates))
 
 
-def _highest_beside(task, result) -> float:
+def _highest_beside(result) -> float:
     """The highest score of any further effect."""
-    return max((abs(c.z) for c in screened(result, task.choices)), default=0.0)
+    return max((abs(c.z) for c in screened(result, result.choices)), default=0.0)
 
 
 def by_cells(task, evidence) -> Evidence | None:

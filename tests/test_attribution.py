@@ -221,6 +221,23 @@ def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
 
 
 @pytest.mark.parametrize(
+    ("z", "plain", "ends", "left", "rough"),
+    [(32.0, 3.4, 1.7, 4.7, True), (32.0, 3.4, 1.7, 9.0, False), (12.0, 3.4, 1.7, 4.7, False), (32.0, 3.4, 2.6, 4.7, False), (90.0, 20.0, 2.0, 4.7, False)],
+    ids=["clear", "something else scores", "by chance", "takes little", "a strong effect whose law is not met"],
+)  # fmt: skip
+def test_an_effect_that_no_density_imitates_is_named_beside_a_rough_one(monkeypatch, z, plain, ends, left, rough):
+    import fitting.rough as module
+
+    monkeypatch.setattr(module, "screened", lambda *a: [candidate("creep", left)])
+    before, current = (SimpleNamespace(chi2_per_sample=c, data_count=COUNT, choices=Choices()) for c in (plain, ends))
+    best = dataclasses.replace(trial("transport_delay", ends), candidate=candidate("transport_delay", z))
+    evidence = Evidence(
+        Reached(current, [(best, [best], [best], before)], {}), (), before, before, (), (), None, ((), ()), {}, {}, ()
+    )
+    assert module.is_rough(evidence, ()) == rough
+
+
+@pytest.mark.parametrize(
     ("z", "ends", "kept"), [(5.8, 2.5, False), (5.8, 1.5, True), (20.0, 2.5, True)], ids=["by chance", "takes most", "scores"]
 )
 def test_what_takes_little_of_a_misfit_that_no_score_tells_of_is_dropped(z, ends, kept):
@@ -248,6 +265,7 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
         plain=plain,
         candidates=(candidate("creep", 12.0),),
         excess=1.4,
+        share=0.4,
     )
     large = (2e-6, 4e-7, 4e-7)[: len(after)] if len(after) > 1 else (2e-7,)
     rows = [{"rms_before": b, "rms_after": a, "noise_rms": 5e-8} for b, a in zip(large, after, strict=True)]
