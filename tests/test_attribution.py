@@ -292,14 +292,21 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
         (CLASSES["second_mode"](gain=0.01, f2=66.0, xi2=1.6), False),
         (CLASSES["duffing_stiffness"](k3=0.3, k5=4.0), True),
         (CLASSES["duffing_stiffness"](k3=0.3, k5=38.0), False),
+        (CLASSES["coulomb_friction"](f=2e-5, v_s=1e-3, presliding=1e-6), True),
+        (CLASSES["coulomb_friction"](f=2e-5, v_s=0.2, presliding=1e-6), False),
+        (CLASSES["coulomb_friction"](f=2e-5, v_s=1e-3, presliding=3e-5), False),
     ],
-    ids=["a mode", "two lags", "a spring", "a stop"],
+    ids=["a mode", "two lags", "a spring", "a stop", "friction", "a damper", "a spring with losses"],
 )
 def test_a_law_bent_into_another_is_not_named(effect, physical):
-    """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop."""
+    """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop, friction that
+    is viscous throughout a delay beside a creep."""
     from fitting.attribute import _physical
 
-    assert _physical(effect, SimpleNamespace(estimate=lambda name: SimpleNamespace(value=0.01))) is physical
+    assert (
+        _physical(effect, SimpleNamespace(estimate=lambda name: SimpleNamespace(value=float(getattr(effect, effect.amplitude)))))
+        is physical
+    )
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from .base import AbstractEffect
 
 STEEPEST = 50.0  # f over presliding, both m: a rod springs back by 2 f at a turn, so that a shorter way hardly shows
 NEWTON = 8  # steps to the displacement that a sample's friction allows; from the side where they only approach
+VISCOUS = 0.1  # m/s, below which friction that is still viscous is none: a damper
+NEVER_PAST = 2e-5  # m of presliding, within which the rod hardly leaves it: a spring with losses
 PASSES = 7  # over a period; each begins with the steady response to the friction of the one before
 FINEST = 2000  # samples a period at least: after each turn the rod swings at its own frequency, far above a slow drive's
 
@@ -75,6 +77,10 @@ class CoulombFriction(AbstractEffect):
     source = "P. R. Dahl (1968); C. Canudas de Wit et al., IEEE Trans. Autom. Control 40 (1995) 419, and references there"
     signature = "a step at each turning point, of the same size at every amplitude and frequency"
     amplitude = "f"
+
+    def is_itself(self) -> bool:
+        """Not where it is viscous at every velocity, or never past its presliding."""
+        return bool((self.v_s < VISCOUS) & (self.presliding < NEVER_PAST))
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with friction, m; of a steady period on a grid of `FINEST` samples or more."""
