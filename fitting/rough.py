@@ -14,6 +14,7 @@ from .verdict import FULL_SHARE, HALF, NULL_CHI2, ROUGH_CHI2, Z_THRESHOLD, Evide
 
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CLEAR_Z = 20.0  # the score of an effect that no density imitates: on nulls at chi2/N of 3 the highest are 6 to 7
+NEXT_TO_IT = 0.3  # of its score
 CELLS_BETTER = 0.95  # of the hats' generalized cross-validation, that cells must end below
 CELLS_ALONE, CELLS_LEAVE = 0.9, 1.45  # the same where they are to explain a misfit alone, and the chi2/N that they must come below
 VERY_ROUGH_CHI2 = 6.0  # chi2/N that a density may leave where the scores tell nothing
@@ -62,11 +63,11 @@ def is_rough(evidence, checks) -> bool:
 
 def _clear(evidence) -> bool:
     """Whether what was found scored far beyond what a rough density ever leaves, takes most of a misfit that one may leave, and
-    leaves nothing that scores beyond that."""
+    leaves nothing that scores beyond that, or next to what it scored itself."""
     first = evidence.reached.steps[0][0].candidate
     if abs(first.z) < CLEAR_Z or evidence.share < HALF or evidence.plain.chi2_per_sample > REFINE_BELOW:
         return False
-    return _highest_beside(evidence.reached.current) < SECOND_Z
+    return _highest_beside(evidence.reached.current) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
 
 
 def on_cells_alone(task, evidence) -> Evidence | None:

@@ -222,8 +222,8 @@ def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
 
 @pytest.mark.parametrize(
     ("z", "plain", "ends", "left", "rough"),
-    [(32.0, 3.4, 1.7, 4.7, True), (32.0, 3.4, 1.7, 9.0, False), (12.0, 3.4, 1.7, 4.7, False), (32.0, 3.4, 2.6, 4.7, False), (90.0, 20.0, 2.0, 4.7, False)],
-    ids=["clear", "something else scores", "by chance", "takes little", "a strong effect whose law is not met"],
+    [(32.0, 3.4, 1.7, 4.7, True), (32.0, 3.4, 1.7, 10.0, False), (36.0, 3.4, 1.7, 8.7, True), (12.0, 3.4, 1.7, 4.7, False), (32.0, 3.4, 2.6, 4.7, False), (90.0, 20.0, 2.0, 4.7, False)],
+    ids=["clear", "something else scores", "next to nothing else", "by chance", "takes little", "a strong effect whose law is not met"],
 )  # fmt: skip
 def test_an_effect_that_no_density_imitates_is_named_beside_a_rough_one(monkeypatch, z, plain, ends, left, rough):
     import fitting.rough as module
