@@ -144,13 +144,20 @@ def convergence_part(sketch, fit):
     return sketch(steps if len(steps) >= FEWEST_STEPS else None, misfit.convergence, steps)
 
 
+def _small(lengths) -> str:
+    """One length in metres or two, in micrometres or nanometres."""
+    values = [float(v) for v in lengths.groups() if v]
+    factor, unit = (1e6, "µm") if max(values) >= 1e-6 else (1e9, "nm")
+    return " → ".join(f"{factor * v:.3g}" for v in values) + f" {unit}"
+
+
 def sentence(text: str) -> str:
     """A message with a capital (unless it begins with a name) and a full stop, its signs as people write them."""
     text = re.sub(r"(?<=\d)%", "\u00a0%", text)
     text = text.strip().replace(" -> ", " → ").replace("chi2/N", "χ²/N").replace("= nan", "= not a number")
     if not text:
         return ""
-    text = NANOMETRES.sub(lambda m: " → ".join(f"{1e9 * float(v):.3g}" for v in m.groups() if v) + " nm", text)
+    text = NANOMETRES.sub(_small, text)
     text = MICROMETRES.sub(lambda m: f"{1e6 * float(m[1]):.4g} µm", text)
     first = text.split()[0].rstrip(",:;.")
     return (text[0].upper() + text[1:] if first.isalpha() else text) + ("" if text.endswith((".", "?", "!")) else ".")

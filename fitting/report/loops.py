@@ -138,7 +138,7 @@ def _loop(axes, loop, drive_factor, factor, heading):
 def _strip(axes, loop, strips, fine):
     phase = loop["phase"]
     band = 2 * fine * float(np.median(loop["noise"]))  # bins that do not divide the period hold one sample more or less
-    axes.axhspan(-band, band, color=PALE, lw=0, label="twice the noise")
+    axes.axhspan(-band, band, color=PALE, lw=0, label="twice the noise of the mean")
     axes.axhline(0, color=MUTED, lw=0.5)
     below = {"lw": 2.6, "alpha": 0.45} if len(strips) > 1 else {"lw": 0.9}  # seen under the other
     styles = {"model": {"color": MODEL, **below}, "after": {"color": INK, "lw": 0.8}}

@@ -246,7 +246,7 @@ def convergence(history, stem: str = "convergence"):
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1), borderaxespad=0)
         ends = "; ".join(f"{name}: {plain(v[0])} to {plain(v[-1])} in {len(v)}" for name, v in stages)
-        return picture(figure, stem, "Convergence", f"Misfit after each Jacobian; the dotted line is the noise. {ends}.")
+        return picture(figure, stem, "Convergence", f"Misfit after each Jacobian; the grey line is the noise. Stages: {ends}.")
 
 
 def stages_of(history) -> list[tuple[str, list[float]]]:

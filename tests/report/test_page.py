@@ -318,7 +318,7 @@ def test_loops_say_what_was_added_and_what_the_band_is(diagnoses, folders, tmp_p
     shutil.copy(folders["attributed"] / "report.npz", tmp_path)
     (tmp_path / "diagnosis.json").write_text(json.dumps(found))
     page = rebuild(tmp_path).read_text(encoding="utf-8")
-    assert page.count(">after, with excess loss</text>") == 2 and page.count(">twice the noise</text>") == 2
+    assert page.count(">after, with excess loss</text>") == 2 and page.count(">twice the noise of the mean</text>") == 2
     assert ">1</td>" not in page.split("Parameters of the repaired model")[2].split("</table>")[0]  # a number has no unit
 
 
@@ -529,6 +529,7 @@ def test_messages_read_as_sentences():
         sentence("excess loss: chi2/N falls. check: 4.81e-08 -> 4.6e-08 m; 1e-3 m")
         == "Excess loss: χ²/N falls. check: 48.1 → 46 nm; 1e-3 m."
     )
+    assert sentence("A zero 4.27e-06 m away") == "A zero 4.27 µm away."
     assert sentence("") == ""
 
 
