@@ -20,7 +20,7 @@ TONES = {
     "unknown_at": "warn",
     "data_problem": "bad",
 }
-RUN_PLACEBO = "To run it: add --placebo 20 to the command that made this folder."
+RUN_PLACEBO = "To run it: magjax diagnose of these recordings with --placebo 20."
 HERE = re.compile(r"; run magjax diagnose on the same files| \(magjax diagnose tells which\)")  # a fit's advice, followed here
 FILE = re.compile(r"(?:^|[.] )(\S+[.]\w+): ")  # that an error begins with
 FRAMED = (
