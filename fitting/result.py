@@ -126,5 +126,9 @@ def model_as_dict(actuator, bench) -> dict:
 
 
 def write_model(folder: Path, actuator, bench) -> None:
-    """model.json in a folder."""
-    write_atomically(folder / "model.json", json.dumps(model_as_dict(actuator, bench)))
+    """model.json in a folder; none, and no earlier one, where a fit broke down."""
+    model = model_as_dict(actuator, bench)
+    if not all(np.isfinite(v) for v in model["parameters"].values()) or not np.isfinite(model["hysteresis"]["masses"]).all():
+        (folder / "model.json").unlink(missing_ok=True)
+        return
+    write_atomically(folder / "model.json", json.dumps(model))

@@ -39,6 +39,12 @@ def check_sizes(name: str, channels: dict, units: dict, bench):
     `units`: the unit in which each column is said to be, so that the mend names the one in which it would make sense.
     """
 
+    for quantity, values in channels.items():
+        if np.isinf(values).any():
+            raise RecordingError(
+                f"{name}: {quantity} is infinite at sample {int(np.argmax(np.isinf(values)))}; leave its cell empty, or record again"
+            )
+
     def mend(quantity, value, usual):
         size = np.abs(channels[quantity])
         high = np.flatnonzero(size > 0.1 * np.nanmax(size))

@@ -375,6 +375,8 @@ def _one(name, columns, units, origin, bench) -> Recording:
         time = columns["time"] - columns["time"][0]
     channels = {q: v for q, v in columns.items() if q != "time"}
     if not quasistatic:
+        if not np.median(np.diff(time)) > 0:
+            raise RecordingError(f"{name}: time does not increase from most samples to the next; rewrite the time column")
         widest = int(round(np.diff(time).max() / max(float(np.median(np.diff(time))), 1e-300))) - 1
         time, channels, bridged = bridge_gaps(time, channels, bench.drive)
         if bridged:

@@ -1,5 +1,7 @@
 """Recordings out: CSV, NetCDF, MATLAB, Parquet, and datasets as NetCDF, each whole or not at all."""
 
+import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,19 @@ UNITS = {
     "current": "A", "command": "A", "field": "A/m", "displacement": "m", "reference": "m", "flux_density": "T", "magnetization": "A/m",
     "polarization": "C/m^2", "voltage": "V", "temperature": "degC",
 }  # fmt: skip
+
+
+def as_json(content, indent: int | None = None) -> str:
+    """JSON that any parser takes: null for what is not a finite number."""
+
+    def plain(value):
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(content), allow_nan=False, indent=indent)
 
 
 def write_recording(path, recording) -> None:

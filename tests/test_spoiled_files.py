@@ -243,3 +243,30 @@ def test_options_that_cannot_work_are_refused_first(tmp_path, options, why, caps
 def test_a_drive_that_is_hardly_felt_is_warned_of(tmp_path):
     card = inspect(read(tmp_path, rows(columns=(TIME, 1e-3 * CURRENT, READING))), load_bench("aa-050h"))
     assert any("unit and scale" in w for w in card.warnings) and not card.problems
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "why"), [("displacement_m", np.inf, "infinite at sample 5"), ("time_s", 0.0, "does not increase")]
+)
+def test_what_no_number_can_be_is_one_line(tmp_path, column, value, why):
+    """A single infinite sample, and times that are the same but for a jump."""
+    columns = {"time_s": TIME.copy(), "current_A": CURRENT, "displacement_m": 3e-5 + 1e-5 * CURRENT + 1e-8 * NOISE}
+    columns[column][slice(5, 6) if column != "time_s" else slice(0, -1)] = value
+    np.savetxt(tmp_path / "a.csv", np.stack(list(columns.values()), 1), delimiter=",", header=",".join(columns), comments="")
+    with pytest.raises(RecordingError, match=why):
+        load_recordings([tmp_path / "a.csv"], load_bench("aa-050h"))
+
+
+def test_json_holds_no_numbers_that_are_none():
+    assert json.loads(as_json({"a": [1.0, float("nan")], "b": {"c": float("inf")}})) == {"a": [1.0, None], "b": {"c": None}}
+
+
+def test_a_fit_that_broke_down_leaves_no_model(tmp_path):
+    from fitting.result import write_model
+
+    bench = load_bench("aa-050h")
+    actuator = bench.actuator()
+    write_model(tmp_path, actuator, bench)
+    assert (tmp_path / "model.json").exists()
+    write_model(tmp_path, actuator.replace({"coil.R_eddy": float("nan")}), bench)
+    assert not (tmp_path / "model.json").exists()

@@ -73,15 +73,14 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         if name
         else "No fit was tried."
     )
-    said = (
-        "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file."
-        if broken
-        else ""
-    )
+    broken_down = "The fit broke down: its misfit is not a number. Check the signs and units of the channels in the bench file."
+    told = sentence(spoken(found["message"], names))
+    known = found["data_problem"] is not None  # the cause was found
+    said = [told, broken_down] if broken and known else [broken_down] if broken else [told]
     return {
         "title": f"Diagnosis of {name}" if name else "Diagnosis", "facts": about, "tone": "bad" if broken else tone(found),
-        "headline": "No verdict can be trusted: the fit broke down" if broken else headline(found),
-        "message": [said or sentence(spoken(found["message"], names))], "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
+        "headline": "No verdict can be trusted: the fit broke down" if broken and not known else headline(found),
+        "message": said, "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
     }  # fmt: skip
 
 

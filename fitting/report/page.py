@@ -10,6 +10,7 @@ from magjax.errors import ConfigurationError
 from ..result import write_atomically
 from . import store
 
+ALWAYS = ("chi2_per_sample", "bic", "effective_unknowns", "residual_rms")
 TEMPLATE = Path(__file__).parent / "page.html"
 
 
@@ -19,13 +20,11 @@ def rebuild(folder: Path, progress=None) -> Path:
     `progress(text)` is called before each figure. Raises `ConfigurationError` where the folder holds no result.
     """
     folder = Path(folder)
-    for name in ("diagnosis", "fit"):
-        path = folder / f"{name}.json"
-        if path.exists():
-            content = _read(path)
-            break
-    else:
+    written = [folder / f"{name}.json" for name in ("diagnosis", "fit") if (folder / f"{name}.json").exists()]
+    if not written:
         raise ConfigurationError(f"{folder}: holds no fit.json or diagnosis.json; give a folder that magjax fit or diagnose wrote")
+    path = max(written, key=lambda p: p.stat().st_mtime_ns)  # a fit may stand beside an earlier diagnosis
+    content, name = _read(path), path.stem
     say = (lambda text: None) if progress is None else (lambda text: progress(f"report: {text}"))
     needed, again = ("base", "diagnose") if name == "diagnosis" else ("chi2_per_sample", "fit")
     if not isinstance(content, dict) or needed not in content:
@@ -40,14 +39,23 @@ def rebuild(folder: Path, progress=None) -> Path:
         from .diagnosis_page import diagnosis_page as make
     else:
         from .fit_page import fit_page as make
-    page = make(content, evidence, say)
+    try:
+        page = make(content, evidence, say)
+    except (KeyError, TypeError) as error:
+        raise ConfigurationError(f"{path}: is no result ({type(error).__name__}: {error}); run magjax {again} again") from None
     return render(folder / "report.html", page, content.get("reproduce", ""), content.get("versions", ""), f"{name}.json")
+
+
+def _with_numbers(row):
+    """A JSON object whose numbers that are always there are NaN where a fit broke down: the file has null for them."""
+    always = (*ALWAYS, "stderr") if "free" in row else ALWAYS
+    return {k: float("nan") if v is None and k in always else v for k, v in row.items()}
 
 
 def _read(path):
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
+        return json.loads(path.read_text(encoding="utf-8"), object_hook=_with_numbers)
+    except (ValueError, OSError) as error:
         raise ConfigurationError(f"{path}: not valid JSON ({error}); run the fit or the diagnosis again") from None
 
 

@@ -24,7 +24,7 @@ RC = {
     "axes.labelcolor": INK, "text.color": INK, "xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
     "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "lines.linewidth": 1.2, "legend.frameon": False,
     "axes.axisbelow": True, "svg.fonttype": "none", "svg.hashsalt": "magjax", "hatch.linewidth": 0.5, "figure.dpi": 72, "path.simplify": True,
-    "axes.formatter.useoffset": False, "axes.formatter.limits": (-3, 4), "axes.formatter.use_mathtext": False, "mathtext.fontset": "dejavusans",
+    "axes.formatter.useoffset": False, "axes.formatter.limits": (-3, 4), "axes.formatter.use_mathtext": False, "text.parse_math": False, "mathtext.fontset": "dejavusans",
 }  # fmt: skip
 
 

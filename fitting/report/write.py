@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from magjax.terms import MAGNETIC
+from magjax.writers import as_json
 
 from ..result import write_atomically, write_model
 from . import store
@@ -24,7 +25,7 @@ def write_fit(folder: Path, result, recordings, content: dict, reproduce: str, p
 
     folder = Path(folder)
     content = {**content, "reproduce": reproduce, "versions": versions()}
-    write_atomically(folder / "fit.json", json.dumps(content, indent=1))
+    write_atomically(folder / "fit.json", as_json(content, indent=1))
     write_model(folder, result.actuator, result.bench)
     _say(progress, "report: signals")
     found = {**evidence.of_fit(result), "drive": result.bench.drive}
@@ -46,11 +47,13 @@ def write_diagnosis(
 
     folder = Path(folder)
     content = {**content, "reproduce": reproduce, "versions": versions()}
-    write_atomically(folder / "diagnosis.json", json.dumps(content, indent=1))
+    write_atomically(folder / "diagnosis.json", as_json(content, indent=1))
     base, repaired = diagnosis.base, diagnosis.repaired
     best = repaired or base
     found = {}
-    if best is not None:
+    if best is None:
+        (folder / "model.json").unlink(missing_ok=True)  # of an earlier result
+    else:
         write_model(folder, best.actuator, best.bench)
         found["drive"] = best.bench.drive
     _say(progress, "report: signals")

@@ -2,8 +2,6 @@
 
 import argparse
 import gc
-import json
-import math
 import os
 import sys
 from pathlib import Path
@@ -89,16 +87,10 @@ def output_folder(path) -> Path | None:
 
 
 def as_json(content) -> str:
-    """JSON that any parser takes: null for what is not a finite number."""
+    """JSON that any parser takes."""
+    from ..writers import as_json as written
 
-    def plain(value):
-        if isinstance(value, dict):
-            return {k: plain(v) for k, v in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [plain(v) for v in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(plain(content), allow_nan=False)
+    return written(content)
 
 
 def refuse_overwriting(out, *inputs) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import html.parser
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -162,6 +163,34 @@ def test_rebuilds_from_the_numbers_alone(folders, tmp_path):
     (place / "diagnosis.json").write_text("{")
     with pytest.raises(ConfigurationError, match="not valid JSON"):
         rebuild(place)
+    (place / "diagnosis.json").write_text('{"base": {}}')
+    with pytest.raises(ConfigurationError, match="is no result"):
+        rebuild(place)
+    (place / "diagnosis.json").write_bytes(b"\xff\xfe{")
+    with pytest.raises(ConfigurationError, match="not valid JSON"):
+        rebuild(place)
+    shutil.copy(folders["fit"] / "fit.json", place / "fit.json")  # the page is that of the result that was written last
+    os.utime(place / "diagnosis.json", ns=(0, 0))
+    assert "coil.R_eddy" in rebuild(place).read_text(encoding="utf-8")
+
+
+def test_a_fit_that_broke_down_still_has_a_page(folders, tmp_path):
+    """Its file has null for what is no number."""
+    content = json.loads((folders["fit"] / "fit.json").read_text())
+    content |= {"chi2_per_sample": None, "bic": None, "effective_unknowns": None}
+    for row in content["parameters"].values():
+        row["stderr"] = None if row["free"] else row["stderr"]
+    (tmp_path / "fit.json").write_text(json.dumps(content))
+    assert "coil.R_eddy" in rebuild(tmp_path).read_text(encoding="utf-8")
+
+
+def test_names_are_drawn_as_they_are():
+    from fitting.report.style import canvas, styled
+
+    with styled():
+        figure = canvas(2, 2)
+        figure.text(0.1, 0.5, "a$b^{_$.csv")
+        figure.canvas.draw()
 
 
 def test_the_banner_of_a_fit(folders):
