@@ -21,11 +21,11 @@ from .on_lines import hum_score, offset_score, zeros_score
 from .reach import BEYOND
 from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect, zeros_of
 from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance
+from .rows import DRIFTS
 from .search import screened, search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
 from .verdict import (
-    DRIFTS,
     SILENT_CHI2,
     WORSE,
     Z_THRESHOLD,

@@ -35,9 +35,10 @@ from .attribute import (
 from .check import check_errors
 from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, rests_of
 from .instruments import RINGING, mode_as_filter
+from .rows import SLOW
 from .screen import screen
 from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, HALF, NULL_CHI2, SILENT_CHI2, SLOW, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, NULL_CHI2, SILENT_CHI2, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects

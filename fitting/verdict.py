@@ -9,13 +9,12 @@ import dataclasses
 
 import numpy as np
 
-from magjax.effects import CLASSES
-
-from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, confidence, rivals_of, tie_of
+from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, rivals_of
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .instruments import exchange
 from .reach import beyond_text
+from .rows import achieved, behind, creeps_on, found_rows, ties_of
 
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 Z_THRESHOLD = 5.5  # about forty columns are looked at
@@ -34,11 +33,7 @@ DOMINANT_TEXT = " What is left is the form of its law, or something weaker besid
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
-CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
-DRIFTS = ("zero_drift", "thermal_drift")
-SLOW = ("creep", "magnetic_aftereffect")  # effects that go on for longer than a recording
-BEHIND = 5.0  # decades of a creep, that a mean may lack of its end
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
@@ -199,7 +194,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     rows = tuple(check_errors(evidence.raw.actuator, current.actuator, raw, evidence.bench, clean)) if raw else ()
     common = {
         "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
-        "candidates": _achieved(evidence), "repaired": current if steps or evidence.adopted else None,
+        "candidates": achieved(evidence), "repaired": current if steps or evidence.adopted else None,
     }  # fmt: skip
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
     foretold = before > WELL_FORETOLD[0] * len(rows) and after < WELL_FORETOLD[1] * before
@@ -213,7 +208,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
         evidence = dataclasses.replace(evidence, reached=unconfirmed(evidence.reached))
-    effects, groups, sizes, rivals = _found(evidence)
+    effects, groups, sizes, rivals = found_rows(evidence)
     if not effects and not groups:
         return _silent(evidence, common, dropped, rough)
     swap = exchange(current, evidence.bench)
@@ -222,15 +217,15 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         groups.append(["sensor_lag", "second_mode"])
     asked = instrument_request({"source", "sensor"} if evidence.command_only else {"sensor"}) if swap else None
     if groups:
-        found = _grouped(evidence, common | {"rivals": sizes, "ties": _ties(evidence)}, effects, groups, rivals, swap, asked)
+        found = _grouped(evidence, common | {"rivals": sizes, "ties": ties_of(evidence)}, effects, groups, rivals, swap, asked)
     else:
         found = _attributed(evidence, common, effects, swap, asked)
     form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
     for effect, _ in evidence.adopted:
         if effect.shapes.get("zeros"):
-            slow = _behind(effect, evidence)
+            slow = behind(effect, evidence)
             form += BEHIND_TEXT.format(slow) if slow else ZEROS_TEXT.format(effect.amplitude)
-        elif _creeps_on(effect, evidence) and CREEPS_TEXT not in form:
+        elif creeps_on(effect, evidence) and CREEPS_TEXT not in form:
             form += CREEPS_TEXT
     form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
@@ -268,92 +263,6 @@ def unconfirmed(reached):
     """The same with more rivals to the effects found, where check recordings are missed as far with them as without."""
     steps = [(best, rivals_of(best, good, UNCONFIRMED_TIE), good, previous) for best, _, good, previous in reached.steps]
     return dataclasses.replace(reached, steps=steps)
-
-
-def _achieved(evidence) -> tuple:
-    """The candidates as the screening of the plain fit scored them, with what real fits achieved.
-
-    A trial counts beside the fit that it was tried beside. The one effect that a repair adds counts as it ended.
-    """
-    steps, current, plain = evidence.reached.steps, evidence.reached.current, evidence.plain
-    fitted = evidence.reached.tried | {best.name: best.candidate for best, *_ in steps}
-    if len(steps) == 1:
-        best, drop = steps[0][0], float(chi2_of(plain) - chi2_of(current))
-        bic = float(best.parameters * np.log(plain.data_count) - drop)
-        fitted[best.name] = dataclasses.replace(best.candidate, achieved_chi2_drop=drop, bic_change=bic)
-    keys = ("achieved_chi2_drop", "bic_change")
-    return tuple(
-        dataclasses.replace(c, **{k: getattr(fitted[c.name], k) for k in keys}) if c.name in fitted else c
-        for c in evidence.candidates
-    )
-
-
-def _found(evidence):
-    """Effects that stand alone (rows), groups (names), the size that each of their members would have, and the trials of the
-    last group."""
-    effects, groups, sizes, last = [], [], {}, []
-    for effect, rivals in evidence.adopted:
-        if _creeps_on(effect, evidence) or _behind(effect, evidence):
-            continue
-        same = next((e for e in effects if e["name"] == effect.name), None)
-        group = any(effect.name in g for g in groups)
-        if same:  # within recordings and between them
-            same["parameters"] |= _record_row(effect)["parameters"]
-        elif rivals and not group:
-            groups.append([effect.name, *[r.name for r in rivals]])
-            sizes |= {r.name: _record_row(r)["parameters"] for r in (effect, *rivals)}
-        elif not group:
-            effects.append(_record_row(effect))
-    for best, rivals, good, _ in evidence.reached.steps:
-        if len(rivals) > 1:
-            groups.append([t.name for t in rivals])
-            sizes |= {t.name: _sizes(t.name, evidence.reached.current if t is best else t.result) for t in rivals}
-            last = rivals
-        else:
-            effects.append(_effect_row(best, good, evidence.raw, evidence.reached.current))
-    alone = {e["name"] for e in effects}
-    groups = [g for g in groups if not (set(g) <= set(DRIFTS) and set(g) & alone)]  # its means tell a drift from its rival
-    return effects, groups, sizes, last
-
-
-def _ties(evidence) -> dict:
-    """For each member of a group what a fit with it reached, and why it is not told from the best: name -> chi2_per_sample, why."""
-    ties = {}
-    for effect, rivals in evidence.adopted:
-        why = "between the harmonics its score comes near the best's"
-        ties |= {r.name: {"chi2_per_sample": None, "why": why if r is not effect else ""} for r in (effect, *rivals) if rivals}
-    for best, rivals, *_ in evidence.reached.steps:
-        for t in rivals if len(rivals) > 1 else ():
-            result = evidence.reached.current if t is best else t.result
-            why = "" if t is best else tie_of(best, t) or tie_of(best, t, UNCONFIRMED_TIE)
-            ties[t.name] = {"chi2_per_sample": result.chi2_per_sample, "why": why}
-    return ties
-
-
-def _creeps_on(effect, evidence) -> bool:
-    """Whether a drift within the records is a creep that was found, going on: all but a fifth of it to one side of the mean
-    displacement, away from where all came from, and less than a decade of it."""
-    actuator = evidence.reached.current.actuator
-    found = "creep" in {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
-    if not found or effect.name not in DRIFTS or not effect.columns:
-        return False
-    scale = 1.0 if effect.shapes.get("own") else effect.amplitude
-    drifts = scale * np.asarray([column[-1] - column[0] for column in effect.columns])
-    means = np.asarray([s.reading[0].real for s in evidence.raw.spectra])
-    after = abs(np.sum(drifts * means)) > CREEPS_AFTER * np.sum(np.abs(drifts * means))
-    return bool(after and np.all(np.abs(drifts) < float(actuator.effect("creep").gain) * np.abs(means)))
-
-
-def _behind(effect, evidence) -> str | None:
-    """The slow effect that was found, where zeros of the recordings are what each lacks of its end; None elsewhere."""
-    actuator = evidence.reached.current.actuator
-    found = {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
-    slow = next((name for name in SLOW if name in found), None)
-    if slow is None or not effect.shapes.get("zeros"):
-        return None
-    means = np.asarray([s.reading[0].real for s in evidence.raw.spectra])
-    most = BEHIND * float(actuator.effect("creep").gain) * np.sqrt(np.mean(means**2)) if slow == "creep" else np.inf
-    return slow if effect.amplitude < most else None
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
@@ -432,36 +341,3 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
     )
     unknown = {"block": block, "region": region, "explained_share": float(np.clip(evidence.share, 0, 1))}
     return Diagnosis("unknown_at", text + note, unknown=unknown, **common)
-
-
-def _effect_row(trial, tried, base, final) -> dict:
-    """An effect found: its size, and from what to what the constants of the base moved."""
-    result = final if any(e.name == trial.name for e in final.actuator.effects) else trial.result
-    shifts = {
-        e.name: [e.value, result.estimate(e.name).value] for e in base.estimates if e.free and not e.name.startswith("effects.")
-    }
-    return {
-        "name": trial.name, "block": trial.candidate.block, "parameters": _sizes(trial.name, result),
-        "confidence": confidence(trial, tried), "shifts": shifts,
-    }  # fmt: skip
-
-
-def _sizes(name, result) -> dict:
-    """The parameters of an effect as a fit has them, without the details of its law that were held."""
-    prefix = f"effects.{name}."
-    return {
-        e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit}
-        for e in result.estimates
-        if e.name.startswith(prefix) and e.free
-    }
-
-
-def _record_row(effect) -> dict:
-    kind = CLASSES[effect.name]
-    info = kind.parameters()[kind.amplitude]
-    size, unit = ("between_recordings", "m") if effect.shapes.get("zeros") else (kind.amplitude, info.unit)
-    return {
-        "name": effect.name, "block": kind.block,
-        "parameters": {size: {"value": effect.amplitude, "stderr": effect.stderr, "unit": unit}},
-        "confidence": float(np.clip(1 - np.exp(-abs(effect.z) / 4), 0, 0.99)), "shifts": {},
-    }  # fmt: skip

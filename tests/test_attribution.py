@@ -10,23 +10,13 @@ import fitting.attribute
 import fitting.search
 from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of, tie_of
 from fitting.record_level import RecordEffect
+from fitting.rows import behind, creeps_on, sizes_of, ties_of
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
 from fitting.uncertainty import Estimate
-from fitting.verdict import (
-    Evidence,
-    _behind,
-    _creeps_on,
-    _grouped,
-    _sizes,
-    _ties,
-    dominant,
-    first_alone,
-    too_little,
-    unconfirmed,
-)  # fmt: skip
+from fitting.verdict import Evidence, _grouped, dominant, first_alone, too_little, unconfirmed  # fmt: skip
 from magjax.effects import CLASSES
 
 COUNT = 700
@@ -95,7 +85,7 @@ def test_a_name_that_no_check_recording_confirms_has_more_rivals():
     assert names(rivals_of(best, [best, near, far])) == ["structural_damping"]
     reached = unconfirmed(Reached(best.result, [(best, [best], [best, near, far], None)], {}))
     assert names(reached.steps[0][1]) == ["structural_damping", "magnetic_aftereffect"]
-    ties = _ties(SimpleNamespace(adopted=(), reached=reached))
+    ties = ties_of(SimpleNamespace(adopted=(), reached=reached))
     assert ties["structural_damping"] == {"chi2_per_sample": 0.959, "why": ""} and list(ties) == names(reached.steps[0][1])
     assert ties["magnetic_aftereffect"]["chi2_per_sample"] == 1.0
     assert (
@@ -332,7 +322,7 @@ def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, 
     ]
     monkeypatch.setattr(module, "check_errors", lambda *a: rows)
     monkeypatch.setattr(module, "exchange", lambda *a: None)
-    monkeypatch.setattr(module, "_found", lambda e: ([{"name": "creep", "block": "mechanics"}], [], {}, []))
+    monkeypatch.setattr(module, "found_rows", lambda e: ([{"name": "creep", "block": "mechanics"}], [], {}, []))
     plain = SimpleNamespace(chi2_per_sample=220.0, data_count=COUNT, actuator=None)
     current = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=None)
     reached = Reached(current, [(trial("creep", chi2n, base=220.0), [], [], plain)], {})
@@ -616,7 +606,7 @@ def test_details_of_a_law_that_were_held_are_no_size():
     rows = [("k", 26.0, 1.1, True), ("rate_knee", 3.8, 2.0, True), ("full", 0.0, 0.0, False)]
     estimates = [Estimate(f"effects.excess_loss.{n}", value, error, "1", "", free, value) for n, value, error, free in rows]
     estimates.append(Estimate("effects.creep.gain", 0.1, 0.01, "1", "", True, 0.0))
-    sizes = _sizes("excess_loss", SimpleNamespace(estimates=estimates))
+    sizes = sizes_of("excess_loss", SimpleNamespace(estimates=estimates))
     assert {n: (p["value"], p["stderr"]) for n, p in sizes.items()} == {"k": (26.0, 1.1), "rate_knee": (3.8, 2.0)}
 
 
@@ -659,10 +649,10 @@ def test_a_drift_that_goes_the_way_of_a_creep_is_the_creep(rates, gain, creeps):
     reached = Reached(SimpleNamespace(actuator=actuator), steps, {})
     spectra = [SimpleNamespace(reading=np.array([3e-5 + 0j])) for _ in rates]
     evidence = SimpleNamespace(reached=reached, raw=SimpleNamespace(spectra=spectra))
-    assert _creeps_on(drift, evidence) is creeps
-    assert not _creeps_on(dataclasses.replace(drift, name="mains_hum"), evidence)
+    assert creeps_on(drift, evidence) is creeps
+    assert not creeps_on(dataclasses.replace(drift, name="mains_hum"), evidence)
     reached.steps.clear()
-    assert not _creeps_on(drift, evidence)
+    assert not creeps_on(drift, evidence)
 
 
 @pytest.mark.parametrize(
@@ -681,7 +671,7 @@ def test_means_beside_a_slow_effect_are_what_it_has_not_come_to(name, zeros, slo
     reached = Reached(SimpleNamespace(actuator=actuator), [(trial(name, 1.0), (), (), None)], {})
     evidence = SimpleNamespace(reached=reached, raw=SimpleNamespace(spectra=[SimpleNamespace(reading=np.array([3e-5 + 0j]))]))
     own = RecordEffect("zero_drift", 20.0, zeros, 1e-9, {"zeros": 1e-5}, ())
-    assert _behind(own, evidence) == slow
-    assert _behind(dataclasses.replace(own, shapes={"own": True}), evidence) is None
+    assert behind(own, evidence) == slow
+    assert behind(dataclasses.replace(own, shapes={"own": True}), evidence) is None
     reached.steps.clear()
-    assert _behind(own, evidence) is None
+    assert behind(own, evidence) is None

@@ -15,12 +15,13 @@ from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
 from fitting.record_level import RecordEffect, remove_from_checks
+from fitting.rows import achieved, found_rows
 from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
 from fitting.spectra import line_deviations
 from fitting.task import Task
-from fitting.verdict import Evidence, _achieved, _found
+from fitting.verdict import Evidence
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording
@@ -113,7 +114,9 @@ def evidence_of(steps, plain, current, candidates, tried):
 def test_shifts_are_those_of_the_base_whatever_step_named_the_effect():
     plain, half, whole = a_fit(15.0, 58.0), a_fit(4.0, 60.0, "creep"), a_fit(1.0, 62.0, "creep", "excess_loss")
     first, second = trial("creep", half, 1100.0), trial("excess_loss", whole, 300.0)
-    effects, *_ = _found(evidence_of([(first, [first], [first], plain), (second, [second], [second], half)], plain, whole, (), {}))
+    effects, *_ = found_rows(
+        evidence_of([(first, [first], [first], plain), (second, [second], [second], half)], plain, whole, (), {})
+    )
     assert [e["shifts"] for e in effects] == [{"coil.R_eddy": [58.0, 62.0]}] * 2
 
 
@@ -123,7 +126,7 @@ def test_a_candidate_keeps_its_score_beside_the_plain_fit_and_shows_what_its_las
     second = trial("excess_loss", whole, 300.0)
     candidates = (scored("excess_loss", 80.0), scored("creep", 70.0), scored("backlash", 3.0))
     tried = {"excess_loss": second.candidate, "creep": trial("creep", plain, 1100.0).candidate}
-    rows = _achieved(evidence_of([(second, [second], [second], plain)], plain, whole, candidates, tried))
+    rows = achieved(evidence_of([(second, [second], [second], plain)], plain, whole, candidates, tried))
     assert [c.z for c in rows] == [80.0, 70.0, 3.0]
     assert [c.achieved_chi2_drop for c in rows] == [1400.0, 1100.0, None]
     assert rows[0].bic_change == pytest.approx(2 * np.log(100) - 1400)
@@ -280,14 +283,14 @@ def test_a_drift_is_told_once():
     between = RecordEffect("zero_drift", 60.0, 1e-6, 1e-8, {"zeros": 1e-5}, ())
     rival = dataclasses.replace(within, name="zero_drift", shapes={})
     evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), adopted=((within, [rival]), (between, [])))
-    effects, groups, *_ = _found(evidence)
+    effects, groups, *_ = found_rows(evidence)
     assert not effects and groups == [["thermal_drift", "zero_drift"]]
     step = trial("thermal_drift", whole, 1000.0)
     found = dataclasses.replace(evidence, reached=Reached(whole, [(step, [step], [step], plain)], {}))
-    effects, groups, *_ = _found(found)
+    effects, groups, *_ = found_rows(found)
     assert [e["name"] for e in effects] == ["thermal_drift"] and not groups
     own = dataclasses.replace(within, name="zero_drift", shapes={"own": True})
-    effects, groups, *_ = _found(dataclasses.replace(evidence, adopted=((own, []), (between, []))))
+    effects, groups, *_ = found_rows(dataclasses.replace(evidence, adopted=((own, []), (between, []))))
     assert [set(e["parameters"]) for e in effects] == [{"rate", "between_recordings"}] and not groups
 
 

@@ -185,12 +185,17 @@ def test_a_fit_that_broke_down_still_has_a_page(folders, tmp_path):
 
 
 def test_names_are_drawn_as_they_are():
+    import io
+
     from fitting.report.style import canvas, styled
 
+    drawn = io.StringIO()
     with styled():
         figure = canvas(2, 2)
-        figure.text(0.1, 0.5, "a$b^{_$.csv")
-        figure.canvas.draw()
+        for k, name in enumerate(("a$b^{_$.csv", "cost$5$_x^2.csv")):
+            figure.text(0.1, 0.3 * k, name)
+        figure.savefig(drawn, format="svg")
+    assert ">a$b^{_$.csv</text>" in drawn.getvalue() and ">cost$5$_x^2.csv</text>" in drawn.getvalue()
 
 
 def test_the_banner_of_a_fit(folders):
