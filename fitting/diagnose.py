@@ -11,11 +11,24 @@ import numpy as np
 from magjax.bench import load_bench
 
 from .alternation import alternating
-from .attribute import BIC_DROP, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
+from .attribute import (
+    BIC_DROP,
+    LIKE_DENSITY,
+    MIN_DROP,
+    MISFIT,
+    SETTLED_CHI2,
+    TIE,
+    WEAK_TIE,
+    chi2_of,
+    excess_of,
+    settled,
+    try_effect,
+)
+from .check import check_errors
 from .fit import FINER_FROM, REFINE_BELOW, finer_than
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
-from .learned import with_learned_term
+from .learned import better_learned, with_learned_term
 from .locate import where
 from .on_lines import hum_score, offset_score, zeros_score
 from .reach import BEYOND
@@ -33,6 +46,7 @@ from .verdict import (
     Evidence,
     least_excess,
     misfit,
+    unexplained,
     verdict,
 )
 
@@ -43,10 +57,10 @@ NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift w
 MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the recordings must hold
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
 ABSORBED_VISIBILITY = 0.004
-LIKE_DENSITY = ("mean_field", "reversible_magnetization")  # of their kin: the density bends to them further than its tangent tells
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
+LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
@@ -190,11 +204,30 @@ def _concluded(task, evidence) -> Diagnosis:
         return verdict(rougher, rough=True)
     if found.verdict == "unknown_at":
         return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], task.progress)
+    if learned := _wrong_name(task, evidence, found):
+        found = unexplained(evidence, found)
+        return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], learned=learned)
     if (rough or found.repaired is not None) and (finer := by_cells(task, evidence)):
         again = verdict(finer)
         again = verdict(finer, rough=True) if rough and again.verdict != found.verdict else again
         found = again if again.verdict == found.verdict else found
     return found
+
+
+def _wrong_name(task, evidence, found):
+    """A learned term that serves far better than the effect that was named, in another block, and foretells the check recordings
+    no worse, where that effect leaves a misfit; None elsewhere."""
+    steps = evidence.reached.steps
+    if found.verdict not in ("attributed", "group") or len(steps) != 1 or not evidence.excess > LEAVES_MISFIT:
+        return None
+    blocks = {t.candidate.block for t in steps[0][1]}
+    current = evidence.reached.current
+    learned = better_learned(evidence.plain, current, blocks, evidence.recordings, evidence.bench, task.progress)
+    if learned is None:
+        return None
+    rows = check_errors(current.actuator, learned.result.actuator, evidence.checks[1], evidence.bench)
+    before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
+    return None if after > WORSE[0] * before + WORSE[1] * len(rows) else learned
 
 
 def _with_zero(found, zero, rival) -> Diagnosis:

@@ -74,7 +74,8 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """Where the iteration ended. `chi2`: of the data alone; `decrement`: what one more step promises."""
+    """Where the iteration ended. `chi2`: of the data alone; `decrement`: what one more step promises; `normal` and `gradient`:
+    of half of chi2 and of what the prior adds."""
 
     z: np.ndarray
     weights: np.ndarray
@@ -82,6 +83,7 @@ class Solution:
     cost: float
     decrement: float
     normal: np.ndarray
+    gradient: np.ndarray
     jacobians: int
     converged: bool
     seconds: float
@@ -304,4 +306,6 @@ def solve(
     # under the weights that are returned: they may have moved after the last step
     normal = state.information + posed["prior"]
     seconds = time.perf_counter() - begin
-    return Solution(z, weights, state.chi2, state.cost, state.decrement, normal, taken, converged, seconds, interrupted)
+    return Solution(
+        z, weights, state.chi2, state.cost, state.decrement, normal, state.gradient, taken, converged, seconds, interrupted
+    )

@@ -14,6 +14,7 @@ from magjax.effects.learned_term import OUTPUTS, UNITS, LearnedTerm
 from magjax.programs import kept
 from magjax.simulate import run_chain
 
+from .attribute import AT_NOISE
 from .check import check_errors
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
@@ -27,6 +28,7 @@ NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
 CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.8  # of the evidence is enough for one variable in place of two, or to be tried beside it
+WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned function leaves where the effect is the wrong name
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 GRID = 121
@@ -281,10 +283,25 @@ def described(learned: Learned) -> dict:
     }  # fmt: skip
 
 
-def with_learned_term(found, base, recordings, bench, check=(), progress=None):
-    """An `unknown_at` with the term that models it, where one is worth it: block and region by it, the repaired model with
-    it, check recordings before and after. `found`: a `Diagnosis`; `base`: the fit that it stands beside."""
+def better_learned(base, named, blocks, recordings, bench, progress=None) -> Learned | None:
+    """A term that shows an effect to be the wrong name: as simple, in another block than `blocks`, it leaves next to nothing of
+    what the effect leaves, and foretells recordings left out better. None elsewhere.
+
+    `base`: the plain fit; `named`: that with the effect.
+    """
     learned = learn(base, recordings, bench, progress)
+    if learned is None or not learned.place.simple or learned.place.block in blocks:
+        return None
+    left, least = (r.chi2_per_sample - AT_NOISE for r in (learned.result, named))
+    far = left > WRONG_NAME * least or learned.left_out[1] > left_out(named.problem, named.solution).mean()
+    return None if far else learned
+
+
+def with_learned_term(found, base, recordings, bench, check=(), progress=None, learned=None):
+    """An `unknown_at` with the term that models it, where one is worth it: block and region by it, the repaired model with
+    it, check recordings before and after. `found`: a `Diagnosis`; `base`: the fit that it stands beside; `learned`: the term,
+    where it is known."""
+    learned = learned or learn(base, recordings, bench, progress)
     if learned is None:
         return dataclasses.replace(
             found, message=found.message + " No smooth function of the signals there foretells recordings left out any better."

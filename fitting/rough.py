@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from .attribute import MIN_DROP, SETTLED_CHI2, chi2_of, excess_of
+from .attribute import LIKE_DENSITY, MIN_DROP, SETTLED_CHI2, chi2_of, excess_of
 from .fit import FINER_FROM, REFINE_BELOW, finer_than
 from .search import SECOND_Z, screened, search
 from .setup import Choices
@@ -22,17 +22,19 @@ NOTHING_OF_IT = 0.04  # of a misfit, as the square of the highest score: physics
 
 
 def without_chance(evidence) -> Evidence:
-    """The evidence without effects that take less than half of a misfit of which the scores tell nothing: by chance, or because
-    the density bends to them, as it does to a mean field."""
-    if not evidence.reached.steps or evidence.share > HALF or not _tells_nothing(evidence):
+    """The evidence without effects that take less than half of a misfit of which the scores tell nothing, or leave one though
+    the density bends to them: they move its steps about by chance."""
+    steps = evidence.reached.steps
+    like_density = evidence.missing and all(best.name in LIKE_DENSITY for best, *_ in steps)
+    if not steps or not _tells_nothing(evidence) or (evidence.share > HALF and not like_density):
         return evidence
     reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
     return dataclasses.replace(evidence, reached=reached)
 
 
 def _tells_nothing(evidence) -> bool:
-    """Whether no effect scores beyond what a rough density leaves, or all next to nothing of the misfit."""
-    highest = max((c.z**2 for c in evidence.candidates), default=0.0)
+    """Whether no effect that a density cannot pass for scores beyond what a rough one leaves, or all next to nothing of the misfit."""
+    highest = max((c.z**2 for c in evidence.candidates if c.name not in LIKE_DENSITY), default=0.0)
     return highest < max(SECOND_Z**2, NOTHING_OF_IT * excess_of(evidence.plain))
 
 
@@ -65,7 +67,12 @@ def _clear(evidence) -> bool:
     """Whether what was found scored far beyond what a rough density ever leaves, takes most of a misfit that one may leave, and
     leaves nothing that scores beyond that, or next to what it scored itself."""
     first = evidence.reached.steps[0][0].candidate
-    if abs(first.z) < CLEAR_Z or evidence.share < HALF or evidence.plain.chi2_per_sample > REFINE_BELOW:
+    if (
+        first.name in LIKE_DENSITY
+        or abs(first.z) < CLEAR_Z
+        or evidence.share < HALF
+        or evidence.plain.chi2_per_sample > REFINE_BELOW
+    ):
         return False
     return _highest_beside(evidence.reached.current) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
 
@@ -107,7 +114,8 @@ def beside_cells(task, evidence) -> Evidence | None:
     if not _cross_validation(cells) < CELLS_BETTER * _cross_validation(plain):
         return None
     first, _, good, _ = steps[0]
-    worth = {t.name for t in good if t.drop > HALF * first.drop}
+    # what moves the cells about finds steps of the density elsewhere, and is no evidence of itself
+    worth = {t.name for t in good if t.drop > HALF * first.drop and t.name not in LIKE_DENSITY}
     candidates = screened(cells, task.choices)
     reached = search(task, cells, [c for c in candidates if c.name in worth], evidence.checks[1])
     if not reached.steps or not reached.current.chi2_per_sample < CELLS_LEAVE or reached.form:

@@ -91,13 +91,14 @@ class ProjectedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 class SteppedState(eqx.Module):
-    """What a step from Python carries: damping, cost (half of chi2 and of what the prior adds), the data's residual and J'J,
-    the fall that is still promised, the fall of the last step, and whether one was taken."""
+    """What a step from Python carries: damping, cost (half of chi2 and of what the prior adds), the data's residual, J'J
+    and the gradient of the cost (J of where the step began), the fall that is still promised, the fall of the last step, and whether one was taken."""
 
     damping: float
     cost: float
     residual: np.ndarray
     information: np.ndarray
+    gradient: np.ndarray
     decrement: float
     gained: float
     good: bool
@@ -125,7 +126,7 @@ class SteppedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         residual, prior = fn(y, args)[0], options["prior"]
-        return SteppedState(1e-2, cost_of(residual, y, prior), residual, np.zeros_like(prior), np.inf, 0.0, False)
+        return SteppedState(1e-2, cost_of(residual, y, prior), residual, np.zeros_like(prior), np.zeros_like(y), np.inf, 0.0, False)
 
     def step(self, fn, y, args, options, state, tags):
         prior, residual, cost, damping = options["prior"], state.residual, state.cost, state.damping
@@ -150,8 +151,9 @@ class SteppedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
                 break
         decrement = float(damped_step(normal, gradient, y, 1e-9, self.bounds)[1])
         if not good:
-            return y, SteppedState(damping, cost, residual, information, decrement, 0.0, False), None
-        return new, SteppedState(damping, new_cost, trial, information, decrement, cost - new_cost, True), None
+            return y, SteppedState(damping, cost, residual, information, gradient, decrement, 0.0, False), None
+        left = J.T @ trial + prior @ new
+        return new, SteppedState(damping, new_cost, trial, information, left, decrement, cost - new_cost, True), None
 
     def terminate(self, fn, y, args, options, state, tags):
         return state.decrement < self.atol + self.rtol * state.cost, optx.RESULTS.successful

@@ -15,6 +15,7 @@ GAUGES = {  # free without a prior beside free masses, and why nothing holds the
 GAUGES |= dict.fromkeys(("piezo.stroke", "piezo.P_m", "piezo.V_m"), "the masses and chi, scaled, do the same: give it a prior")
 NO_PRIOR = 1e-2  # in the optimiser's coordinate: what keeps a parameter finite
 UNDERSMOOTH = 0.1  # parameters are quoted with a tenth of the roughness weights
+UNBIASED_BELOW = 1.3  # chi2/N below which what the floor of the density does to them is told
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,18 +53,39 @@ def covariance(normal: np.ndarray, z: np.ndarray, layout, also=()) -> np.ndarray
     return result
 
 
+def floor_shift(problem, solution) -> np.ndarray:
+    """How far each unknown, apart from the density's, moves in a Newton step that lets the density be negative.
+
+    Where the density is next to nothing noise can only add to it, and the parameters make up for what it adds, by up to 1.5 of
+    their errors. Without the floor the linear fit has no such bias, and errors that are larger, for it knows less.
+    """
+    layout, z = problem.layout, solution.z
+    n = layout.density_unknowns
+    shift = -covariance(solution.normal, z, layout, range(n)) @ solution.gradient
+    lower, upper = layout.bounds
+    shift[(z + shift <= lower) | (z + shift >= upper)] = 0.0
+    shift[:n] = 0.0
+    return shift
+
+
 def estimates(problem, solution, actuator) -> list[Estimate]:
-    """Every declared parameter of the fitted actuator with its error."""
-    layout = problem.layout
-    cov = covariance(solution.normal, solution.z, layout)
+    """Every declared parameter of the fitted actuator with its error.
+
+    At the noise halfway between the fits with and without the floor of the density, and half of what is between them is
+    counted among the errors.
+    """
+    layout, z = problem.layout, solution.z
+    cov = covariance(solution.normal, z, layout)
+    at_noise = solution.chi2 < UNBIASED_BELOW * problem.data_count
+    half = 0.5 * floor_shift(problem, solution) if at_noise else np.zeros_like(z)
     widen = WIDEN_BESIDE if actuator.effects else WIDEN
     inside, rows = layout.inside(solution.z), []
     for name, (value, info) in actuator.parameters().items():
         value = float(np.asarray(value))
         if name in layout.names:
-            index = layout.index(name)
+            index, value = layout.index(name), float(layout.value(name, z + half))
             slope = layout.slope(name, solution.z)
-            stderr = widen * abs(slope) * float(np.sqrt(max(cov[index, index], 0.0)))
+            stderr = widen * abs(slope) * float(np.hypot(np.sqrt(max(cov[index, index], 0.0)), half[index]))
             reach = max(abs(value), info.scale)
             at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach or not inside[index])
             start = float(layout.starts[layout.names.index(name)])

@@ -329,6 +329,12 @@ def _fall(evidence) -> str:
     return f"chi2/N falls from {before:.3g} to {after:.2f}"
 
 
+def unexplained(evidence, found) -> Diagnosis:
+    """The `unknown_at` in place of a verdict that named an effect."""
+    names = ("floors", "where", "absorbed", "base", "check", "candidates", "repaired")
+    return _unknown(evidence, {name: getattr(found, name) for name in names})
+
+
 def _unknown(evidence, common, note: str = "") -> Diagnosis:
     blocks, fields = evidence.where["by_block"], evidence.where["by_field"]
     block = max(blocks, key=blocks.get) if blocks else "hysteresis"

@@ -202,25 +202,33 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     [(1.8, 6.5, True), (1.8, 9.0, False), (4.0, 6.5, True), (4.0, 9.0, True), (4.0, 12.0, False), (7.0, 6.5, False)],
     ids=["a rough density", "something scores", "rougher", "next to nothing of it", "something of it", "too much is left"],
 )
-def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough):
+@pytest.mark.parametrize("like_density", [0.0, 14.0])
+def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough, like_density):
     from fitting.rough import is_rough
 
     plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
-    evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=(candidate("creep", z),), excess=chi2n)
+    scores = (candidate("accommodation", like_density), candidate("creep", z))
+    evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=scores, excess=chi2n)
     assert is_rough(evidence, ()) == rough
 
 
 @pytest.mark.parametrize(
-    ("z", "plain", "ends", "left", "rough"),
-    [(32.0, 3.4, 1.7, 4.7, True), (32.0, 3.4, 1.7, 10.0, False), (36.0, 3.4, 1.7, 8.7, True), (12.0, 3.4, 1.7, 4.7, False), (32.0, 3.4, 2.6, 4.7, False), (90.0, 20.0, 2.0, 4.7, False)],
-    ids=["clear", "something else scores", "next to nothing else", "by chance", "takes little", "a strong effect whose law is not met"],
+    ("z", "plain", "ends", "left", "rough", "name"),
+    [
+        *((*row, "transport_delay") for row in (
+            (32.0, 3.4, 1.7, 4.7, True), (32.0, 3.4, 1.7, 10.0, False), (36.0, 3.4, 1.7, 8.7, True), (12.0, 3.4, 1.7, 4.7, False),
+            (32.0, 3.4, 2.6, 4.7, False), (90.0, 20.0, 2.0, 4.7, False),
+        )),
+        (32.0, 3.4, 1.7, 4.7, False, "mean_field"),
+    ],
+    ids=["clear", "something else scores", "next to nothing else", "by chance", "takes little", "a strong effect whose law is not met", "a density does"],
 )  # fmt: skip
-def test_an_effect_that_no_density_imitates_is_named_beside_a_rough_one(monkeypatch, z, plain, ends, left, rough):
+def test_an_effect_that_no_density_imitates_is_named_beside_a_rough_one(monkeypatch, z, plain, ends, left, rough, name):
     import fitting.rough as module
 
     monkeypatch.setattr(module, "screened", lambda *a: [candidate("creep", left)])
     before, current = (SimpleNamespace(chi2_per_sample=c, data_count=COUNT, choices=Choices()) for c in (plain, ends))
-    best = dataclasses.replace(trial("transport_delay", ends), candidate=candidate("transport_delay", z))
+    best = dataclasses.replace(trial(name, ends), candidate=candidate(name, z))
     evidence = Evidence(
         Reached(current, [(best, [best], [best], before)], {}), (), before, before, (), (), None, ((), ()), {}, {}, ()
     )
@@ -228,15 +236,18 @@ def test_an_effect_that_no_density_imitates_is_named_beside_a_rough_one(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("z", "ends", "kept"), [(5.8, 2.5, False), (5.8, 1.5, True), (20.0, 2.5, True)], ids=["by chance", "takes most", "scores"]
-)
-def test_what_takes_little_of_a_misfit_that_no_score_tells_of_is_dropped(z, ends, kept):
-    """A null on blocks of random masses: a mean field took a quarter of chi2/N = 2.9 at z = -5.8, and ended as `unknown_at`."""
+    ("name", "z", "ends", "kept"),
+    [("backlash", 5.8, 2.5, False), ("backlash", 5.8, 1.5, True), ("backlash", 20.0, 2.5, True), ("mean_field", 20.2, 1.9, False), ("mean_field", 20.2, 1.0, True)],
+    ids=["by chance", "takes most", "scores", "moves the density's steps about", "meets the noise"],
+)  # fmt: skip
+def test_what_takes_little_of_a_misfit_that_no_score_tells_of_is_dropped(name, z, ends, kept):
+    """Nulls on blocks of random masses: a mean field took a quarter of chi2/N = 2.9 at z = -5.8 and ended as `unknown_at`, and half
+    of 3.0 at z = 20 and was named."""
     from fitting.rough import without_chance
 
     plain, current = (SimpleNamespace(chi2_per_sample=c, data_count=COUNT) for c in (2.9, ends))
-    reached = Reached(current, [(trial("mean_field", ends), [], [], plain)], {})
-    evidence = Evidence(reached, (), plain, plain, (candidate("mean_field", z),), (), None, ((), ()), {}, {}, ())
+    reached = Reached(current, [(trial(name, ends), [], [], plain)], {})
+    evidence = Evidence(reached, (), plain, plain, (candidate(name, z),), (), None, ((), ()), {}, {}, ())
     found = without_chance(evidence)
     assert bool(found.reached.steps) is kept and (found.reached.current is current) is kept
 

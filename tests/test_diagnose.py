@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fitting.diagnose as module
+import fitting.learned as learned_module
 import fitting.rough as rough_module
 import fitting.search as search_module
 from fitting.attribute import Trial, chi2_of, rivals_of
@@ -14,6 +15,8 @@ from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.floors import data_problem
+from fitting.learned import Learned
+from fitting.nonparametric import Place
 from fitting.record_level import RecordEffect, remove_from_checks
 from fitting.rows import achieved, found_rows
 from fitting.screen import Candidate
@@ -200,7 +203,7 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
     assert not rough or (found.raw is found.plain is found.reached.current is fits[32] and not found.reached.steps)
 
 
-DROPS = {"second_mode": 1500.0, "transport_delay": 900.0, "backlash": 300.0}
+DROPS = {"second_mode": 1500.0, "mean_field": 1400.0, "transport_delay": 900.0, "backlash": 300.0}
 
 
 @pytest.mark.parametrize(
@@ -248,7 +251,9 @@ def test_a_weak_effect_on_a_rough_density_is_named_beside_cells(monkeypatch, ben
     evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), reached=reached)
     found = rough_module.beside_cells(Task((), bench), evidence)
     assert (found and {t.name for t in found.reached.steps[0][1]}) == named
-    assert asked == ([["second_mode", "transport_delay"]] if unknowns < 300 else [])  # what took half as much on hats
+    assert asked == (
+        [["second_mode", "transport_delay"]] if unknowns < 300 else []
+    )  # what took half as much on hats, and does not move the cells about
     assert found is None or (found.raw is found.plain is cells and found.candidates == tuple(scores))
 
 
@@ -482,3 +487,42 @@ def test_zeros_that_change_from_recording_to_recording_are_told(bench):
     assert error < 6e-8 and apart > 2e-7
     (same,) = module.zeros_of(base.spectra, 9.0, zeros, zeros, ["zero_drift"])  # of what drifts within them there is no rival
     assert same.name == "zero_drift"
+
+
+@pytest.mark.parametrize(
+    ("leaves", "block", "counts", "left_out", "checks", "wrong"),
+    [
+        (0.95, "coil", (20, 1), 9.0, 1.2, True),
+        (2.6, "coil", (20, 1), 9.0, 1.2, False),
+        (0.95, "magnetostriction", (20, 1), 9.0, 1.2, False),
+        (0.95, "coil", (10, 6), 9.0, 1.2, False),
+        (0.95, "coil", (20, 1), 70.0, 1.2, False),
+        (0.95, "coil", (20, 1), 9.0, 4.0, False),
+    ],
+    ids=["wrong", "leaves most of it", "the form of its law", "not simple", "foretells worse", "checks foretold worse"],
+)
+def test_a_learned_function_shows_an_effect_to_be_the_wrong_name(monkeypatch, leaves, block, counts, left_out, checks, wrong):
+    """An eddy resistance that depends on M: quartic_magnetostriction took it from chi2/N 77 to 3.8 and was named."""
+
+    def result(value):
+        return SimpleNamespace(
+            chi2_per_sample=value, data_count=900, problem=None, solution=None, actuator=None, choices=Choices(), spectra=()
+        )
+
+    plain, named = result(77.0), result(3.8)
+    term = SimpleNamespace(counts=counts)
+    place = Place(block, ("magnetization", "flux_rate"), 900.0, 0.96, 0.1, 1.0, 0.2, term)
+    learned = Learned(place, term, result(leaves), None, (100.0, left_out), 0.96)
+    monkeypatch.setattr(learned_module, "learn", lambda *a: learned)
+    monkeypatch.setattr(learned_module, "left_out", lambda *a: np.array([20.0, 60.0]))
+    rows = [{"rms_before": 1.5e-7, "rms_after": checks * 5e-8, "noise_rms": 5e-8}]
+    monkeypatch.setattr(module, "check_errors", lambda *a: rows)
+    best = trial("quartic_magnetostriction", named, 6e4)
+    best = dataclasses.replace(best, candidate=dataclasses.replace(best.candidate, block="magnetostriction"))
+    reached = Reached(named, [(best, [best], [best], plain)], {})
+    evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), reached=reached)
+    found = module._wrong_name(Task((), None), evidence, SimpleNamespace(verdict="attributed"))
+    assert (found is learned) == wrong
+    assert module._wrong_name(Task((), None), evidence, SimpleNamespace(verdict="nothing_missing")) is None
+    met = dataclasses.replace(evidence, reached=dataclasses.replace(reached, current=result(1.3)))
+    assert module._wrong_name(Task((), None), met, SimpleNamespace(verdict="attributed")) is None
