@@ -60,7 +60,7 @@ ABSORBED_VISIBILITY = 0.004
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.2  # of a misfit, that a finer density leaves where the first one was too coarse
-LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
+LEAVES_MISFIT = 2.0  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
@@ -149,6 +149,15 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
     `plain`: a fit of theirs, where it is known; `before_zeros`: task and adopted before zeros of the recordings were; `zeros`:
     whether these may be."""
     plain = task.fit() if plain is None else plain
+    try:
+        return _explained(task, measured, adopted, check, plain, before_zeros, zeros)
+    except KeyboardInterrupt as stop:  # what was reached
+        stop.plain = getattr(stop, "plain", plain)
+        raise
+
+
+def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Diagnosis:
+    """The diagnosis from the plain fit on; arguments as those of `_examined`."""
     if problem := wrong_bench(plain):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
     candidates = screened(plain, task.choices)
@@ -204,13 +213,13 @@ def _concluded(task, evidence) -> Diagnosis:
         return verdict(rougher, rough=True)
     if found.verdict == "unknown_at":
         return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], task.progress)
-    if learned := _wrong_name(task, evidence, found):
-        found = unexplained(evidence, found)
-        return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], learned=learned)
     if (rough or found.repaired is not None) and (finer := by_cells(task, evidence)):
         again = verdict(finer)
         again = verdict(finer, rough=True) if rough and again.verdict != found.verdict else again
         found = again if again.verdict == found.verdict else found
+    if not rough and (learned := _wrong_name(task, evidence, found)):
+        found = unexplained(evidence, found)
+        return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], learned=learned)
     return found
 
 
@@ -218,7 +227,7 @@ def _wrong_name(task, evidence, found):
     """A learned term that serves far better than the effect that was named, in another block, and foretells the check recordings
     no worse, where that effect leaves a misfit; None elsewhere."""
     steps = evidence.reached.steps
-    if found.verdict not in ("attributed", "group") or len(steps) != 1 or not evidence.excess > LEAVES_MISFIT:
+    if found.verdict not in ("attributed", "group") or len(steps) != 1 or not found.repaired.chi2_per_sample > LEAVES_MISFIT:
         return None
     blocks = {t.candidate.block for t in steps[0][1]}
     current = evidence.reached.current

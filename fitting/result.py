@@ -105,8 +105,11 @@ class FitResult:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all."""
     partial = path.with_name(path.name + ".part")
-    partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
-    partial.replace(path)
+    try:
+        partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def model_as_dict(actuator, bench) -> dict:

@@ -90,6 +90,29 @@ def load_calibrations(paths, bench) -> list[Recording]:
     return found
 
 
+def refuse_absent_and_twice(recordings, checks=(), more=()) -> None:
+    """Raise `RecordingError` where a file is not there, and `ConfigurationError` where one is given twice, as a recording or to
+    check: it would count twice, or check nothing."""
+    seen = {}
+    for path, what in (
+        *((p, "recording") for p in recordings),
+        *((p, "check") for p in checks),
+        *((p, "calibration") for p in more),
+    ):
+        path = Path(path)
+        if not path.exists():
+            raise RecordingError(f"{path}: no such file; check the name")
+        if not path.is_file() or what == "calibration":
+            continue
+        content = hashlib.sha256(path.read_bytes()).digest()
+        if content in seen:
+            other, before = seen[content]
+            same = "is given twice" if other.resolve() == path.resolve() else f"holds the same as {other}"
+            counts = "a check that is also fitted checks nothing" if before != what else "it would count twice"
+            raise ConfigurationError(f"{path}: {same}; {counts}: leave one out")
+        seen[content] = path, what
+
+
 def read_columns(path: Path, bench, quantities) -> dict:
     """Columns of one table as they stand, without a time axis: quantity -> values in SI, for those that it holds."""
     table, _ = _read_table(Path(path))[0]
@@ -277,7 +300,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         column = bench.columns.get(quantity, {})
         found = _find(path, table, quantity, column, required=quantity in (bench.drive, bench.output))
         if found is not None:
-            columns[quantity], units[quantity] = found, _column(table, quantity, column)[1]
+            columns[quantity], units[quantity] = found, _column(path, table, quantity, column)[1]
     if len({len(v) for v in columns.values()}) > 1:
         lengths = ", ".join(f"{q} {len(v)}" for q, v in columns.items())
         raise RecordingError(f"{path}: columns of unequal length ({lengths}); save as many samples of each")
@@ -286,6 +309,11 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
     if split is not None:
         if split not in table:
             raise RecordingError(f"{path}: no column {split} to split at; the file has {', '.join(available)}")
+        bad = ~np.isfinite(np.asarray(table[split], float))
+        if bad.any():
+            raise RecordingError(
+                f"{path}: {split}, at which the file is split, is no number in row {int(np.argmax(bad))}; fill it in"
+            )
         labels = list(dict.fromkeys(table[split]))
         parts = [(f"{path.name}[{split}={label:g}]", table[split] == label) for label in labels]
     else:
@@ -304,7 +332,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
 def _refuse_missing(path, table, bench):
     """Where several columns are missing, one line names them all (of a single one, `_find` tells how to name it)."""
     wanted = (*(() if bench.columns.get("time", {}).get("quasistatic") else ("time",)), bench.drive, bench.output)
-    missing = [q for q in dict.fromkeys(wanted) if _column(table, q, bench.columns.get(q, {}))[0] is None]
+    missing = [q for q in dict.fromkeys(wanted) if _column(path, table, q, bench.columns.get(q, {}))[0] is None]
     if len(missing) > 1:
         usual = ", ".join(bench.columns.get(q, {}).get("name", USUAL[q]) for q in missing)
         raise RecordingError(
@@ -324,20 +352,20 @@ def _refuse_clipping(name, columns, bench):
                 raise
 
 
-def _column(table, quantity, column):
+def _column(path, table, quantity, column):
     """(name, unit) of a quantity's column, as mapped by the bench or by its name; (None, None) where there is none."""
     if "name" in column:
         return (column["name"], column.get("unit")) if column["name"] in table else (None, None)
     found = [n for n in table if _parse(n)[0] == quantity]
     if len(found) > 1:
         raise RecordingError(
-            f"columns {' and '.join(found)} both hold the {quantity}; say which in [columns.{quantity}] of the bench (name = ...)"
+            f"{path}: columns {' and '.join(found)} both hold the {quantity}; say which in [columns.{quantity}] of the bench (name = ...)"
         )
     return (found[0], column.get("unit", _parse(found[0])[1])) if found else (None, None)
 
 
 def _find(path, table, quantity, column, required):
-    name, unit = _column(table, quantity, column)
+    name, unit = _column(path, table, quantity, column)
     if name is None:
         if not required:
             return None
@@ -363,7 +391,7 @@ def _one(name, columns, units, origin, bench) -> Recording:
         raise RecordingError(f"{name}: holds one sample only; record again, or check the columns and the split of the file")
     metadata = dict(origin["metadata"])
     if quasistatic:
-        columns = _uniform_loop({**columns}, bench)
+        columns = _uniform_loop({**columns}, bench, name)
         count = len(columns[bench.drive])
         time = np.arange(count) / count
         metadata["frequency_Hz"] = 1.0
@@ -398,12 +426,13 @@ def _number(value):
         return value
 
 
-def _uniform_loop(columns, bench):
+def _uniform_loop(columns, bench, name):
     """A quasi-static loop given as points: closed, and resampled evenly along its length in (drive, output)."""
     x, y = columns[bench.drive], columns[bench.output]
     bad = ~(np.isfinite(x) & np.isfinite(y))
     if bad.any():
-        raise RecordingError(f"a loop has a NaN at point {int(np.argmax(bad))}; remove that point")
+        raise RecordingError(f"{name}: not a number at point {int(np.argmax(bad))} of the loop; remove that point")
+    refuse_constant(name, bench.drive, x)
     ahead = np.concatenate([[0], np.cumsum(np.abs(np.diff(x)))])
     # points that stand still in the drive carry no new information for a rate-independent loop
     keep = np.concatenate([[True], np.diff(ahead) > 0])

@@ -183,13 +183,14 @@ def test_a_check_recording_that_cannot_be_used_ends_nothing(tmp_path, capsys, mo
         fitting.diagnose, "diagnose", lambda *a, check, **k: held.append(len(check)) or Diagnosis("nothing_missing", "All is well.")
     )
     good, bad = write(tmp_path / "good.csv", good_rows()), write(tmp_path / "bad.csv", *spoil("clipped"))
+    other = write(tmp_path / "other.csv", good_rows()[:-1])
     command = ["diagnose", good, "--bench", "aa-050h", "--quiet", "--check"]
-    assert main([*command, good, bad, "--out", str(tmp_path / "out")]) == 0
+    assert main([*command, other, bad, "--out", str(tmp_path / "out")]) == 0
     said, kept = capsys.readouterr().out, json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert held == [1] and "bad.csv" in said and "clipped" in said and "Left out of the checks" in said
     assert kept["verdict"] == "nothing_missing" and "bad.csv" in kept["check_left_out"][0] and kept["message"] in said
     assert main([*command, str(tmp_path / "none.csv")]) == 3
-    assert "no such file" in capsys.readouterr().out
+    assert "no such file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -257,3 +258,49 @@ def test_the_papers_loops_and_recipe(tmp_path, capsys, monkeypatch):
         drawn = (tmp_path / "figures" / f"{name}.svg").read_text()
         assert drawn.count("clip-path=") >= curves and all(f">{word}" in drawn for word in words), name
     assert page.count("<svg") == 2
+
+
+def test_an_interrupted_diagnosis_keeps_the_plain_fit(folder, capsys, monkeypatch):
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
+    out = folder / "half"
+    monkeypatch.setattr("fitting.diagnose.screened", stopped)
+    assert main(["diagnose", *files, "--bench", "aa-050h", "--out", str(out)]) == 130
+    assert "the plain fit is kept in" in capsys.readouterr().err
+    assert json.loads((out / "fit.json").read_text())["parameters"]["coil.R_eddy"]["free"]
+    assert load_model(out)[1].name == "aa-050h" and (out / "report.html").exists() and not (out / "diagnosis.json").exists()
+    monkeypatch.setattr("fitting.diagnose.spectra_of", stopped)
+    assert main(["diagnose", *files, "--bench", "aa-050h", "--out", str(folder / "before")]) == 130
+    assert "nothing was reached" in capsys.readouterr().err and not (folder / "before").exists()
+
+
+@pytest.mark.parametrize("command", ["fit", "diagnose"])
+@pytest.mark.parametrize(
+    ("again", "why"),
+    [(["--check", "{0}"], "a check that is also fitted checks nothing"), (["{1}"], "is given twice; it would count twice"),
+     (["{copy}"], "holds the same as"), (["--check", "{none}"], "no such file")],
+    ids=["fitted and to check", "twice", "a copy", "not there"],
+)  # fmt: skip
+def test_files_that_are_not_there_or_given_twice_are_refused_first(folder, tmp_path, capsys, command, again, why):
+    files = sorted(folder.glob("rec_*.csv"))
+    copy, kept = tmp_path / "copy.csv", tmp_path / "out"
+    copy.write_bytes(files[0].read_bytes())
+    kept.mkdir()
+    (kept / "diagnosis.json").write_text("{}")  # of an earlier diagnosis
+    more = [a.format(*files, copy=copy, none=tmp_path / "none.csv") for a in again]
+    assert main([command, *map(str, files), *more, "--bench", "aa-050h", "--out", str(kept)]) in (2, 3)
+    said = capsys.readouterr().err
+    assert why in said and len(said.strip().splitlines()) == 1
+    assert [p.name for p in kept.iterdir()] == ["diagnosis.json"]
+
+
+def test_what_cannot_be_written_is_one_line(folder, capsys, monkeypatch):
+    (folder / "taken").mkdir(exist_ok=True)
+    (folder / "taken" / "fit.json").mkdir(exist_ok=True)
+    files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
+    assert main(["fit", *files, "--bench", "aa-050h", "--out", str(folder / "taken"), "--quiet"]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1 and "cannot be read or written" in said[0]
+    assert not list((folder / "taken").glob("*.part"))

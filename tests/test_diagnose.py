@@ -521,8 +521,9 @@ def test_a_learned_function_shows_an_effect_to_be_the_wrong_name(monkeypatch, le
     best = dataclasses.replace(best, candidate=dataclasses.replace(best.candidate, block="magnetostriction"))
     reached = Reached(named, [(best, [best], [best], plain)], {})
     evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), reached=reached)
-    found = module._wrong_name(Task((), None), evidence, SimpleNamespace(verdict="attributed"))
-    assert (found is learned) == wrong
-    assert module._wrong_name(Task((), None), evidence, SimpleNamespace(verdict="nothing_missing")) is None
-    met = dataclasses.replace(evidence, reached=dataclasses.replace(reached, current=result(1.3)))
-    assert module._wrong_name(Task((), None), met, SimpleNamespace(verdict="attributed")) is None
+
+    def asked(verdict, repaired):
+        return module._wrong_name(Task((), None), evidence, SimpleNamespace(verdict=verdict, repaired=repaired))
+
+    assert (asked("attributed", named) is learned) == wrong
+    assert asked("nothing_missing", None) is None and asked("attributed", result(1.6)) is None

@@ -270,3 +270,20 @@ def test_a_fit_that_broke_down_leaves_no_model(tmp_path):
     assert (tmp_path / "model.json").exists()
     write_model(tmp_path, actuator.replace({"coil.R_eddy": float("nan")}), bench)
     assert not (tmp_path / "model.json").exists()
+
+
+def test_points_and_labels_that_are_no_numbers_are_told_with_their_file(tmp_path):
+    label = np.repeat([1.0, 2.0], len(TIME) // 2)
+    label[7] = np.nan
+    table = rows(head="loop,current_A,flux_density_T", columns=(label, CURRENT, READING))
+    own = tmp_path / "loops.toml"
+    own.write_text('name = "loops"\n[columns.time]\nquasistatic = true\nsplit = "loop"\n')
+    with pytest.raises(RecordingError, match=r"loops.csv: loop, at which the file is split, is no number in row 7"):
+        read(tmp_path, table, "loops.csv", own)
+    own.write_text('name = "loops"\n[columns.time]\nquasistatic = true\n')
+    broken = CURRENT.copy()
+    broken[3] = np.nan
+    for drive, why in ((broken, "not a number at point 3"), (np.zeros_like(CURRENT), "current never changes")):
+        table = rows(head="current_A,flux_density_T", columns=(drive, READING))
+        with pytest.raises(RecordingError, match=f"loops.csv.*{why}"):
+            read(tmp_path, table, "loops.csv", own)

@@ -37,9 +37,12 @@ def fold(flat) -> dict:
 def save(folder: Path, evidence: dict) -> None:
     """Write the evidence whole or not at all."""
     partial = Path(folder) / (FILE + ".part")
-    with partial.open("wb") as target:
-        np.savez_compressed(target, **unfold(evidence))
-    partial.replace(Path(folder) / FILE)
+    try:
+        with partial.open("wb") as target:
+            np.savez_compressed(target, **unfold(evidence))
+        partial.replace(Path(folder) / FILE)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def load(folder: Path) -> dict:

@@ -71,6 +71,12 @@ def main(arguments=None) -> int:
         return 130
     except BrokenPipeError:
         return 0
+    except OSError as error:
+        if error.errno is None:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"magjax {arguments[0]}: {where}cannot be read or written ({error.strerror}); choose another place", file=sys.stderr)
+        return 2
     except Exception:
         if not seen():
             raise

@@ -71,9 +71,10 @@ def run_fit(arguments) -> int:
     options = p.parse_args(arguments)
     check_intervals(options)
     prepare_jax()
-    from magjax.readers import load_checks, load_recordings
+    from magjax.readers import load_checks, load_recordings, refuse_absent_and_twice
 
     folder = output_folder(options.out)
+    refuse_absent_and_twice(options.recordings, options.check)
     from fitting.check import check_errors
     from fitting.fit import fit
     from fitting.reach import beyond_text
@@ -151,10 +152,11 @@ def run_diagnose(arguments) -> int:
     check_placebo(options)
     prepare_jax()
     from magjax.errors import RecordingError
-    from magjax.readers import load_calibrations, load_checks, load_sound
+    from magjax.readers import load_calibrations, load_checks, load_sound, refuse_absent_and_twice
 
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
+    refuse_absent_and_twice(options.recordings, options.check, options.calibration)
     if bench.output == "strain":
         if options.placebo:
             raise ConfigurationError("--placebo simulates recordings, and strain curves have a law instead; leave it out")
@@ -179,6 +181,8 @@ def run_diagnose(arguments) -> int:
                     stopped = error
     except RecordingError as error:
         found, shown = unusable(errors or [error], recordings if errors else ()), error.shown
+    except KeyboardInterrupt as stop:
+        return _kept_plain(getattr(stop, "plain", None), recordings, folder, arguments)
     content = found.as_dict()
     if folder:
         from fitting.report import write_diagnosis
@@ -199,6 +203,19 @@ def run_diagnose(arguments) -> int:
     if stopped is not None:
         raise stopped
     return 3 if found.verdict == "data_problem" else 0
+
+
+def _kept_plain(plain, recordings, folder, arguments) -> int:
+    """What an interrupted diagnosis leaves: the plain fit, if it was there."""
+    if plain is None or folder is None:
+        print("magjax diagnose: interrupted; nothing was reached that could be kept", file=sys.stderr)
+        return 130
+    from fitting.report import write_fit
+
+    content = {**plain.as_dict(), "check": [], "check_left_out": []}
+    write_fit(folder, plain, recordings, content, _reproduce("diagnose", arguments))
+    print(f"magjax diagnose: interrupted; the plain fit is kept in {folder} (report.html, fit.json, model.json)", file=sys.stderr)
+    return 130
 
 
 def _diagnose_strain(options, bench, folder) -> int:
