@@ -12,6 +12,7 @@ from magjax.effects import SensorLag
 from .attribute import (
     BIC_DROP,
     CLOSE,
+    COMPANIONS,
     FEEDBACKS,
     MIN_DROP,
     MISFIT,
@@ -38,7 +39,7 @@ from .instruments import RINGING, mode_as_filter
 from .rows import SLOW
 from .screen import screen
 from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, HALF, NULL_CHI2, SILENT_CHI2, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, NULL_CHI2, SILENT_CHI2, Z_THRESHOLD, misfit
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
@@ -46,6 +47,7 @@ NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within w
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
 LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
+PROMISED_ANEW = 0.8  # of what an effect has brought beside the others, that another must promise there to be tried
 IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise
 NOTHING = 2.0  # standard errors within which an amplitude is none
 FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
@@ -119,9 +121,9 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
             return state
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         _backward(task, state)
-        _exchange(task, state)
+        _exchange(task, state, check)
         if _commuted(task, state, scored.get("sensor_lag")):
-            _exchange(task, state)
+            _exchange(task, state, check)
     if state.steps and state.current is not state.steps[-1][0].result:
         ends(state.current)
     return state
@@ -242,22 +244,26 @@ def _nothing(result, name) -> bool:
     return abs(found.value - effect.parameters()[effect.amplitude].null) < NOTHING * (found.stderr or 0.0)
 
 
-def _exchange(task, state):
+def _exchange(task, state, check=()):
     """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
     that was not theirs. Where that changes one, the same goes for the last."""
-    changed = [_exchanged(task, state, index) for index in range(len(state.steps) - 1)]
+    changed = [_exchanged(task, state, index, check) for index in range(len(state.steps) - 1)]
     if any(changed):
         _exchanged(task, state, len(state.steps) - 1)
 
 
-def _exchanged(task, state, index) -> bool:
+def _exchanged(task, state, index, check=()) -> bool:
     """The best of an effect adopted and its near rivals, beside all others; whether it is another."""
     best, _, good, previous = state.steps[index]
     behind = max(NEAR_RIVAL * chi2_of(best.result), NEAR_SHARE * best.drop)
-    near = [t for t in good if t is not best and t.bic_change < best.bic_change + behind]
-    if not near or best.name not in {e.name for e in state.current.actuator.effects}:
+    others = {e.name for e in state.current.actuator.effects} - {best.name}
+    near = [t for t in good if t is not best and t.name not in others and t.bic_change < best.bic_change + behind]
+    if best.name not in {e.name for e in state.current.actuator.effects}:
         return False
     rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
+    fresh = _promised_anew(task, state.current, rest, {best.name, *others, *(t.name for t in near)}, check)
+    if not near and not fresh:
+        return False
     cost = best.parameters * np.log(rest.data_count)
     trials = [Trial(best.candidate, state.current, 0.0, cost, True, best.explained_share, best.parameters)]
     near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
@@ -267,11 +273,38 @@ def _exchanged(task, state, index) -> bool:
 
     for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
         trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
-    trials = [t for t in trials if t.physical]
+    trials = [t for t in trials + fresh if t.physical]
     found = min(trials, key=lambda t: t.bic_change)
     state.steps[index] = (found, rivals_of(found, trials), trials, previous)
     state.current = found.result
     return found.name != best.name
+
+
+def _promised_anew(task, current, rest, known, check) -> list[Trial]:
+    """Effects that a screening beside the others alone promises to serve as well as the one adopted with them, fitted, where the
+    check recordings are missed though the noise is met. `rest`: the current fit without that one; `known`: those tried.
+
+    An effect that imitates two is adopted first, and neither of them need be among its rivals then.
+    """
+    if not check or current.chi2_per_sample > MISFIT or not _missed(current, check, task.bench):
+        return []
+    task.say("what else goes with the others", current.chi2_per_sample)
+    base = task.fit_on(rest, rest.actuator)
+    gap = max(chi2_of(base) - chi2_of(current), MIN_DROP)
+    candidates = screened(base, task.choices)
+    promised = [c for c in leaders(candidates) if c.name not in known and c.z**2 > PROMISED_ANEW * gap][:SIDE_BY_SIDE]
+    kin = {name for c in promised for name in COMPANIONS.get(c.name, ())} - known - {c.name for c in promised}
+    trials = []
+    for c in (*promised, *(c for c in candidates if c.name in kin)):
+        result = _to_the_end(task, base, c, gap).result
+        trials.append(credited(c, result, current, result.actuator.effect(c.name), gap))
+    return trials
+
+
+def _missed(result, check, bench) -> bool:
+    """Whether check recordings are foretold to worse than 1.4 of their noise, in the mean of the squares."""
+    rows = check_errors(result.actuator, result.actuator, check, bench)
+    return misfit(rows, "rms_after") > len(rows)
 
 
 def _commuted(task, state, candidate) -> bool:

@@ -461,7 +461,9 @@ def test_a_start_from_which_a_fit_ends_worse_than_without_the_effect_is_taken_ne
 @pytest.mark.parametrize(("changed", "asked"), [(False, [0, 1]), (True, [0, 1, 2])])
 def test_where_an_early_effect_is_exchanged_so_may_the_last_be(monkeypatch, changed, asked):
     found = []
-    monkeypatch.setattr(fitting.search, "_exchanged", lambda task, state, index: found.append(index) or (changed and index == 0))
+    monkeypatch.setattr(
+        fitting.search, "_exchanged", lambda task, state, index, check=(): found.append(index) or (changed and index == 0)
+    )
     fitting.search._exchange(None, Reached(None, [None] * 3, {}))
     assert found == asked
 
@@ -686,3 +688,38 @@ def test_means_beside_a_slow_effect_are_what_it_has_not_come_to(name, zeros, slo
     assert behind(dataclasses.replace(own, shapes={"own": True}), evidence) is None
     reached.steps.clear()
     assert behind(own, evidence) is None
+
+
+@pytest.mark.parametrize(
+    ("chi2n", "after", "known", "tried"),
+    [(1.04, 9e-8, (), ["sensor_lag", "transport_delay", "amplifier_lag"]), (1.04, 5.5e-8, (), []), (1.8, 9e-8, (), []),
+     (1.04, 9e-8, ("sensor_lag",), ["amplifier_lag"])],
+    ids=["checks missed", "checks foretold", "noise not met", "known"],
+)  # fmt: skip
+def test_what_goes_with_a_later_effect_is_sought_anew_where_checks_are_missed(monkeypatch, chi2n, after, known, tried):
+    """A delay beside a creep: structural damping imitates both and is adopted first, and the delay was no rival of its."""
+    import fitting.search as module
+
+    def result(value):
+        return SimpleNamespace(chi2_per_sample=value, data_count=COUNT, actuator=SimpleNamespace(effect=lambda name: None))
+
+    current, alone, found = result(chi2n), result(1.3), []
+    gap = (1.3 - chi2n) * COUNT
+    shares = {"sensor_lag": 1.1, "transport_delay": 0.9, "amplifier_lag": 0.95, "backlash": 0.5}
+    scores = [candidate(name, share * max(gap, 0.0) ** 0.5) for name, share in shares.items()]
+    rows = [{"rms_after": after, "rms_before": after, "noise_rms": 5e-8}] * 2
+    monkeypatch.setattr(module, "check_errors", lambda *a: rows)
+    monkeypatch.setattr(module, "screened", lambda *a: scores)
+    monkeypatch.setattr(module, "leaders", lambda candidates: [candidates[0], candidates[2], candidates[3]])
+    monkeypatch.setattr(
+        module, "_to_the_end", lambda task, base, c, gap: found.append(c.name) or SimpleNamespace(result=result(0.97))
+    )
+    monkeypatch.setattr(module, "credited", lambda c, *a: trial(c.name, 0.97, base=chi2n))
+    monkeypatch.setattr("fitting.task.Task.fit_on", lambda *a, **k: alone)
+    task = Task((), SimpleNamespace(), Choices())
+    if known:
+        scores = [c for c in scores if c.name != "transport_delay"]
+        monkeypatch.setattr(module, "leaders", lambda candidates: candidates)
+    made = module._promised_anew(task, current, current, {"creep", *known}, ["check"])
+    assert sorted(found) == sorted(tried) and len(made) == len(tried)
+    assert module._promised_anew(task, current, current, {"creep"}, ()) == []
