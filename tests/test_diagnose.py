@@ -64,6 +64,7 @@ def test_silent_where_nothing_is_missing(bench):
             "next_experiment", "placebo", "message", "base", "repaired", "ties"} == set(content)  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_base_of_a_diagnosis_is_that_on_the_finer_density_that_was_asked_for(bench):
     runs, checks = study(bench)
     coarse = Choices(fine=250, knots=(8, 6), without=tuple(e.name for e in CATALOGUE))

@@ -156,10 +156,10 @@ def run_diagnose(arguments) -> int:
 
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
+    if bench.output == "strain" and options.placebo:
+        raise ConfigurationError("--placebo simulates recordings, and strain curves have a law instead; leave it out")
     refuse_absent_and_twice(options.recordings, options.check, options.calibration)
     if bench.output == "strain":
-        if options.placebo:
-            raise ConfigurationError("--placebo simulates recordings, and strain curves have a law instead; leave it out")
         return _diagnose_strain(options, bench, folder)
     from fitting.diagnose import diagnose
     from fitting.setup import Choices

@@ -128,7 +128,7 @@ def read_trajectory(path, columns=None):
         mapped = (columns or {}).get(quantity, {})
         if mapped.get("name") not in table:
             mapped = {}
-        if _column(table, quantity, mapped)[0] is None:
+        if _column(path, table, quantity, mapped)[0] is None:
             raise RecordingError(f"{path}: no {quantity} column among {', '.join(table)}; name it {USUAL[quantity]}")
         found.append(_find(path, table, quantity, mapped, required=True))
     time, wanted = found
