@@ -19,11 +19,15 @@ from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, field_of_
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
-FINER_HATS = ({"knots": (26, 18), "level": 104},)
 CELLS = tuple({"knots": None, "level": level} for level in (32, 40))  # a mass a cell: a rough density may need them
-FINEST_HATS = ({"knots": (36, 24), "level": 144},)  # where the field is known loops are steep, and cells too wide
-FINER_FROM = (1.05, 1.5)  # chi2/N from which each is tried,
-FINER_TAKES = (0.7, 0.5)  # and the share of the excess that it may leave
+FINER = (  # densities that are tried where the misfit asks for them, step by step, those of one step side by side
+    ({"knots": (26, 18), "level": 104},),
+    ({"knots": (36, 24), "level": 108}, *CELLS),
+    ({"knots": (48, 32), "level": 120},),
+)
+FINER_MATERIAL = FINER[0], ({"knots": (36, 24), "level": 144},), ()  # where the field is known loops are steep, and cells too wide
+FINER_FROM = (1.05, 1.5, 2.0)  # chi2/N from which each step is tried,
+FINER_TAKES = (0.7, 0.5, 0.5)  # and the share of the excess that it may leave
 CELLS_MEET = 1.25  # chi2/N that cells must reach too: they take up physics, but not all of it
 REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
 REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be the density
@@ -190,19 +194,18 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
             continue
         # a finer density must take its share of the excess, and five standard deviations
         target = min(0.95 * count + takes * max(solution.chi2 - 0.95 * count, 0.0), solution.chi2 - 25)
-        if densities[0].knots is None:
-            target = min(target, CELLS_MEET * count)
+        targets = [min(target, CELLS_MEET * count) if finer.knots is None else target for finer in densities]
 
-        def tried(finer, known=problem, before=solution, target=target):
+        def tried(finer, target, known=problem, before=solution):
             return lambda say: _on_density(known, before, actuator, bench, names, finer, spectra, target, say)
 
         try:
-            trials = together([tried(finer) for finer in densities], report)
+            trials = together([tried(*pair) for pair in zip(densities, targets, strict=True)], report)
         except KeyboardInterrupt:
             return problem, dataclasses.replace(solution, interrupted=True), choices
-        trial_problem, trial, finer = min(trials, key=lambda t: t[1].chi2)
-        if trial.chi2 < target:
-            problem, solution, choices = trial_problem, trial, finer
+        met = [trial for trial, target in zip(trials, targets, strict=True) if trial[1].chi2 < target]
+        if met:
+            problem, solution, choices = min(met, key=lambda trial: trial[1].chi2)
     return problem, solution, choices
 
 
@@ -221,11 +224,23 @@ def _on_density(problem, solution, actuator, bench, names, finer, spectra, targe
 
 def finer_than(choices, bench) -> tuple:
     """The densities that may be tried after that of `choices`, those of one step side by side; () for steps that it has taken."""
-    steps = FINER_HATS, CELLS if bench.drive == "current" else FINEST_HATS
+    steps = FINER if bench.drive == "current" else FINER_MATERIAL
     steps = tuple(tuple(dataclasses.replace(choices, **row) for row in step) for step in steps)
     if choices.knots is None:
         return ((),) * len(steps)
-    return tuple(tuple(row for row in step if row.knots is None or row.knots > choices.knots) for step in steps)
+    taken = [any(row.knots is not None and row.knots <= choices.knots for row in step) for step in steps]
+    return tuple(() if done else step for step, done in zip(steps, taken, strict=True))
+
+
+def cells_beside(choices) -> tuple:
+    """Densities of a mass a cell to set beside one of hats; () where it is of cells itself."""
+    return () if choices.knots is None else tuple(dataclasses.replace(choices, **row) for row in CELLS)
+
+
+def finer_hats(choices) -> tuple:
+    """The next finer hats; () after the finest, and where the density is of cells."""
+    rows = (row for step in FINER for row in step if row["knots"] is not None and choices.knots is not None)
+    return tuple(dataclasses.replace(choices, **row) for row in rows if row["knots"] > choices.knots)[:1]
 
 
 def _with_parameters(new_problem, z, problem, solution):

@@ -22,6 +22,8 @@ from .solver import CHUNK, SteppedLevenbergMarquardt, cost_of, pushed
 from .together import together
 
 WEIGHT_RANGE = (1e-3, 1e9)
+LET_GO, HELD = 30, 0.8  # by what weights fall that hold a fit far above the noise, while chi2 falls to this share of it
+STIFF = 1.0  # weights that may hold a fit off its target, or still
 FAR = 20.0  # chi2/N above which the weights stay, and an iteration that no longer falls is given up:
 STALLED, STALL = 6, 1e-3  # Jacobians, and the share of chi2 that they must take
 AT_END = (
@@ -268,6 +270,11 @@ def solve(
         posed["prior"] = prior_matrix(problem, new)
         return dataclasses.replace(state, cost=cost_of(state.residual, z, posed["prior"]))
 
+    def let_go(chi2):
+        """Where it stands, lower weights, the state under them, and a path and gains that begin anew."""
+        lower = np.maximum(weights / LET_GO, WEIGHT_RANGE[0])
+        return chi2, lower, weighed(z, state, lower), [chi2], []
+
     begin, converged, interrupted, taken, held = time.perf_counter(), False, False, 0, np.inf
     state = solver.init(residual_at, z, None, posed, None, None, frozenset())
     path, gains = [state.chi2], []
@@ -279,10 +286,14 @@ def solve(
             if progress is not None:
                 progress(taken, chi2 / count)
             path.append(chi2)
-            if taken > 3 and chi2 - 8 * state.decrement > target or _too_slow(path, max_jacobians - taken, target):
-                break
-            if chi2 / count > FAR and len(path) > STALLED and chi2 > (1 - STALL) * path[-STALLED]:
-                break
+            far = chi2 / count > FAR
+            missed = taken > 3 and chi2 - 8 * state.decrement > target or _too_slow(path, max_jacobians - taken, target)
+            stuck = far and len(path) > STALLED and chi2 > (1 - STALL) * path[-STALLED]
+            if missed or stuck:
+                if not (far and evidence and weights.max() > STIFF and chi2 < HELD * held):
+                    break
+                held, weights, state, path, gains = let_go(chi2)  # a rough density, held by what was meant for a smooth one
+                continue
             stalled = len(gains) >= AT_END[0] and sum(gains[-AT_END[0] :]) < max(AT_END[1], AT_END[2] * state.cost)
             settled = stalled or bool(solver.terminate(residual_at, z, None, posed, state, frozenset())[0])
             if evidence and chi2 / count < FAR:
@@ -293,9 +304,9 @@ def solve(
                 settled = stalled or settled and moved < 0.3
             elif evidence and settled:
                 # settled far above the noise: as long as the prior, not the physics, holds it there, let go
-                if chi2 < 0.8 * held and weights.max() > 10 * WEIGHT_RANGE[0]:
-                    held, weights, settled, gains = chi2, np.maximum(weights / 30, WEIGHT_RANGE[0]), False, []
-                    state = weighed(z, state, weights)
+                if chi2 < HELD * held and weights.max() > 10 * WEIGHT_RANGE[0]:
+                    held, weights, state, path, gains = let_go(chi2)
+                    settled = False
             if settled or not state.good:
                 converged = state.decrement < 1.0 + (PROMISED if stalled else 1e-3) * state.cost
                 if settled or not evidence or state.decrement < 1.0:

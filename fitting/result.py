@@ -62,10 +62,11 @@ class FitResult:
     def __str__(self):
         lines = [f"{'converged' if self.converged else 'NOT CONVERGED'}: {self.message}", ""]
         lines += [f"  {e}" for e in self.estimates if e.free]
-        lines += ["", f"  {'recording':30s} {'f / Hz':>8s} {'noise':>10s} {'residual':>10s} {'chi2/N':>8s}"]
+        width = max([30, *(len(Path(r.file).name) for r in self.recordings)])
+        lines += ["", f"  {'recording':{width}s} {'f / Hz':>8s} {'noise':>10s} {'residual':>10s} {'chi2/N':>8s}"]
         for r in self.recordings:
             lines.append(
-                f"  {Path(r.file).name[:30]:30s} {r.frequency:8.4g} {r.noise_rms:10.3g} {r.residual_rms:10.3g} {r.chi2_per_sample:8.3g}"
+                f"  {Path(r.file).name:{width}s} {r.frequency:8.4g} {r.noise_rms:10.3g} {r.residual_rms:10.3g} {r.chi2_per_sample:8.3g}"
             )
         lines.append("")
         lines.append(

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from .attribute import LIKE_DENSITY, MIN_DROP, SETTLED_CHI2, chi2_of, excess_of
-from .fit import FINER_FROM, REFINE_BELOW, finer_than
+from .fit import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats
 from .search import SECOND_Z, screened, search
 from .setup import Choices
 from .task import freed_beyond
@@ -88,7 +88,7 @@ def on_cells_alone(task, evidence) -> Evidence | None:
     near = SETTLED_CHI2 < current.chi2_per_sample < ROUGH_CHI2 and plain.chi2_per_sample < REFINE_BELOW
     if task.bench.drive != "current" or evidence.adopted or plain.choices.knots is None or not near:
         return None
-    cells = min(_fits_on_cells(task, plain), key=_cross_validation, default=plain)
+    cells = min(_fits_on(task, plain, cells_beside(plain.choices)), key=_cross_validation)
     if not (cells.chi2_per_sample < CELLS_LEAVE and _cross_validation(cells) < CELLS_ALONE * _cross_validation(plain)):
         return None
     if evidence.reached.steps:
@@ -110,7 +110,7 @@ def beside_cells(task, evidence) -> Evidence | None:
     if not steps or task.bench.drive != "current" or evidence.adopted or plain.choices.knots is None or not near:
         return None
     task.say("on masses of cells", current.chi2_per_sample)
-    cells = min(_fits_on_cells(task, plain), key=_cross_validation)
+    cells = min(_fits_on(task, plain, cells_beside(plain.choices)), key=_cross_validation)
     if not _cross_validation(cells) < CELLS_BETTER * _cross_validation(plain):
         return None
     first, _, good, _ = steps[0]
@@ -140,9 +140,9 @@ def _highest_beside(result) -> float:
 
 
 def by_cells(task, evidence) -> Evidence | None:
-    """The same with masses of cells in the final model, where they promise to foretell better; None elsewhere.
+    """The same with masses of cells or finer hats in the final model, where they promise to foretell better; None elsewhere.
 
-    After the verdict, for they take up physics too, which hats leave for an effect to explain. By generalized
+    After the verdict, for cells take up physics too, which hats leave for an effect to explain. By generalized
     cross-validation: on densities that hats follow, cells lower chi2 and foretell far worse.
     """
     current, plain = evidence.reached.current, evidence.plain
@@ -152,21 +152,22 @@ def by_cells(task, evidence) -> Evidence | None:
         or (current is plain and evidence.raw is not plain)
     ):
         return None
-    best = min(_fits_on_cells(task, current), key=_cross_validation, default=current)
+    densities = (*finer_hats(current.choices), *cells_beside(current.choices))
+    best = min(_fits_on(task, current, densities), key=_cross_validation, default=current)
     if not _cross_validation(best) < CELLS_BETTER * _cross_validation(current):
         return None
     finer = dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, current=best))
     return dataclasses.replace(finer, raw=best, plain=best) if current is plain else finer
 
 
-def _fits_on_cells(task, result) -> list:
-    """Fits of the same on densities of cells."""
+def _fits_on(task, result, densities) -> list:
+    """Fits of the same on other densities."""
     same = {"extra": freed_beyond(result), "spectra": result.spectra, "refine": False}
 
     def on(choices):
         return lambda say: task.on(progress=say).fit(result.actuator, choices=choices, **same)
 
-    return together([on(choices) for choices in finer_than(result.choices, task.bench)[1]], task.progress)
+    return together([on(choices) for choices in densities], task.progress)
 
 
 def _cross_validation(result) -> float:

@@ -31,6 +31,7 @@ DOMINANT = (
 PROMISES = 8.0  # times the Newton decrement, that going on with a fit may gain at most
 DOMINANT_TEXT = " What is left is the form of its law, or something weaker beside it: no other effect takes nearly as much."
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
+NO_BETTER = (3.0, 10.0, 0.8)  # chi2/N and check recordings' misfit from which what explains the one must lower the other to this share
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
@@ -206,6 +207,9 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         return verdict(first) if first is not None else _unknown(evidence, common)
     if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
+    far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
+    if steps and far_off and after > NO_BETTER[2] * before:
+        return _unknown(evidence, common, " The repair that fits best predicts the check recordings hardly better, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
         evidence = dataclasses.replace(evidence, reached=unconfirmed(evidence.reached))
     effects, groups, sizes, rivals = found_rows(evidence)

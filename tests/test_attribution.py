@@ -292,12 +292,13 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
         (CLASSES["second_mode"](gain=0.01, f2=66.0, xi2=0.9), True),
         (CLASSES["second_mode"](gain=0.01, f2=66.0, xi2=1.6), False),
         (CLASSES["duffing_stiffness"](k3=0.3, k5=4.0), True),
+        (CLASSES["duffing_stiffness"](k3=0.017, k5=15.2), True),
         (CLASSES["duffing_stiffness"](k3=0.3, k5=38.0), False),
         (CLASSES["coulomb_friction"](f=2e-5, v_s=1e-3, presliding=1e-6), True),
         (CLASSES["coulomb_friction"](f=2e-5, v_s=0.2, presliding=1e-6), False),
         (CLASSES["coulomb_friction"](f=2e-5, v_s=1e-3, presliding=3e-5), False),
     ],
-    ids=["a mode", "two lags", "a spring", "a stop", "friction", "a damper", "a spring with losses"],
+    ids=["a mode", "two lags", "a spring", "a spring near its stop", "a stop", "friction", "a damper", "a spring with losses"],
 )
 def test_a_law_bent_into_another_is_not_named(effect, physical):
     """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop, friction that
@@ -320,8 +321,13 @@ def test_a_law_bent_into_another_is_not_named(effect, physical):
         (2.0, (7.0, 8.0), (1.05, 1.3), "attributed"),
         (2.0, (7.0, 8.0), (1.05, 3.0), "unknown_at"),
         (10.5, (7.0, 8.0), (1.05, 1.3), "unknown_at"),
+        (1.0, (7.0, 8.0), (6.8, 7.5), "unknown_at"),
+        (1.0, (7.0, 8.0), (5.0, 6.0), "attributed"),
     ],
-    ids=["foretells", "foretells worse", "a little left", "much left", "much left and all foretold", "not all", "far too much"],
+    ids=[
+        "foretells", "foretells worse", "a little left", "much left", "much left and all foretold", "not all", "far too much",
+        "hardly better", "better",
+    ],
 )
 def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, chi2n, before, after, word):
     """One of two check recordings may get better and the other far worse: together they are worse."""

@@ -16,7 +16,7 @@ import magjax.bench
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import DensityBasis, cell_basis, hat_basis
-from fitting.fit import finer_than, fit, guessed, loose, valleys
+from fitting.fit import cells_beside, finer_hats, finer_than, fit, guessed, loose, valleys
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
@@ -62,10 +62,29 @@ def test_reaches_the_noise_and_the_constants(result):
     assert "coil.R_eddy" in str(result)
 
 
+@pytest.mark.long
+def test_a_density_of_blocks_is_met_by_finer_hats():
+    """Blocks of masses that differ tenfold leave chi2/N of 50 on the first hats, which passed for physics, and 4 on the next."""
+    bench, rng = load_bench("aa-050h"), np.random.default_rng(0)
+    truth, block = concealed_actuator(bench), np.random.default_rng(0)
+    masses = np.asarray(truth.hysteresis.masses)
+    edges = np.sort(block.choice(np.arange(10, 150), 7, replace=False))
+    place = np.searchsorted(edges, np.arange(len(masses)), side="right")
+    blocks = masses * np.exp(2 * block.standard_normal((8, 8)))[np.ix_(place, place)]
+    plane = Preisach(blocks * masses.sum() / blocks.sum(), truth.hysteresis.low, truth.hysteresis.high, truth.hysteresis.offset)
+    truth = dataclasses.replace(truth, hysteresis=plane)
+    drives = (10, 0.8, 0.1), (20, 0.5, -0.2), (50, 0.8, 0.1), (80, 0.5, -0.2), (120, 0.8, 0.1)
+    result = fit([record(truth, *drive, rng, f"{drive[0]} Hz") for drive in drives], bench, refine=100.0)
+    assert result.choices.knots >= (36, 24) and result.chi2_per_sample < 2
+    assert result.estimate("coil.R_eddy").value == pytest.approx(62.0, rel=0.005)
+
+
 def test_finer_densities_are_tried_in_steps(bench):
-    hats, cells = finer_than(Choices(), bench)
-    assert [c.knots for c in hats] == [(26, 18)] and [(c.knots, c.level) for c in cells] == [(None, 32), (None, 40)]
-    assert finer_than(hats[0], bench) == ((), cells) and finer_than(cells[0], bench) == ((), ())
+    hats, rough, finest = finer_than(Choices(), bench)
+    assert [c.knots for c in hats] == [(26, 18)] and [(c.knots, c.level) for c in rough[1:]] == [(None, 32), (None, 40)]
+    assert finer_than(hats[0], bench) == ((), rough, finest) and finer_than(rough[1], bench) == ((), (), ())
+    assert rough[0].knots == (36, 24) and finer_than(rough[0], bench) == ((), (), finest) and finest[0].knots == (48, 32)
+    assert cells_beside(hats[0]) == rough[1:] and finer_hats(hats[0]) == rough[:1] and finer_hats(finest[0]) == cells_beside(rough[1]) == ()
     assert [c.knots for c in finer_than(Choices(), load_bench("rod-eddy"))[1]] == [(36, 24)]
 
 

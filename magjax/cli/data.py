@@ -1,9 +1,12 @@
 """Commands check, import, export."""
 
 import json
+import sys
 from pathlib import Path
 
 from .runtime import output_folder, parser, refuse_overwriting
+
+ASSUMED = "aa-050h"  # the bench where none is given
 
 
 def run(command: str, arguments: list[str]) -> int:
@@ -19,12 +22,14 @@ def run_check(arguments, _command) -> int:
         "magjax check rec.csv --bench aa-050h",
     )
     p.add_argument("recordings", nargs="+", help="recordings")
-    p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name")
+    p.add_argument("--bench", help=f"bench file (TOML) or a built-in name (default {ASSUMED})")
     options = p.parse_args(arguments)
     from magjax.bench import load_bench
     from magjax.inspection import inspect_files
 
-    cards = inspect_files(options.recordings, load_bench(options.bench))
+    if options.bench is None:
+        print(f"bench: {ASSUMED} (limits and coil of T&B's actuator); give yours with --bench", file=sys.stderr)
+    cards = inspect_files(options.recordings, load_bench(options.bench or ASSUMED))
     if options.json:
         print(json.dumps([c.as_dict() for c in cards]))
     else:
@@ -40,7 +45,7 @@ def run_convert(arguments, command) -> int:
         f"magjax {command} rec.mat --out rec.nc",
     )
     p.add_argument("recording", help="a recording")
-    p.add_argument("--bench", default="aa-050h", help="bench file (TOML) or a built-in name")
+    p.add_argument("--bench", default=ASSUMED, help="bench file (TOML) or a built-in name")
     p.add_argument("--out", required=True, help="file to write: .nc, .csv, .mat or .parquet")
     options = p.parse_args(arguments)
     from magjax.bench import load_bench

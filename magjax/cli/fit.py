@@ -33,6 +33,11 @@ def _reproduce(command, arguments):
     return "magjax " + command + " " + " ".join(shlex.quote(a) for a in arguments)
 
 
+def _written(folder, *names) -> str:
+    """Where the results are, and which: no model.json stands for a fit that broke down."""
+    return f"{folder} ({', '.join(name for name in names if (folder / name).exists())})"
+
+
 def _bench_and_start(options):
     from magjax.bench import load_bench
 
@@ -128,7 +133,7 @@ def run_fit(arguments) -> int:
         for why in refused:
             print(f"  left out of the checks: {why}")
         if folder:
-            print(f"\nresults in {folder} (report.html, fit.json, model.json)")
+            print(f"\nresults in {_written(folder, 'report.html', 'fit.json', 'model.json')}")
     if stopped is not None:
         raise stopped
     return 130 if result.solution.interrupted else 0 if result.converged else 4
@@ -214,7 +219,8 @@ def _kept_plain(plain, recordings, folder, arguments) -> int:
 
     content = {**plain.as_dict(), "check": [], "check_left_out": []}
     write_fit(folder, plain, recordings, content, _reproduce("diagnose", arguments))
-    print(f"magjax diagnose: interrupted; the plain fit is kept in {folder} (report.html, fit.json, model.json)", file=sys.stderr)
+    kept = _written(folder, "report.html", "fit.json", "model.json")
+    print(f"magjax diagnose: interrupted; the plain fit is kept in {kept}", file=sys.stderr)
     return 130
 
 

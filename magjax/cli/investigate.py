@@ -1,6 +1,7 @@
 """Command investigate."""
 
 import json
+import shlex
 import sys
 
 from .acquire import _record_options, campaign
@@ -76,7 +77,7 @@ def analysis(bench, folder, options, live):
             found,
             recordings,
             content,
-            f"magjax diagnose {' '.join(str(f) for f in files)} --bench {options.bench}",
+            shlex.join(["magjax", "diagnose", *map(str, files), "--bench", str(options.bench), *(["--check", *map(str, checks)] if checks else [])]),
             held,
             bench=bench,
             shown=shown,

@@ -6,7 +6,7 @@ from ..param import param
 from .base import AbstractEffect
 from .forces import with_force
 
-STOP = 10.0  # of k5: the stiffness added at half the reach is then mostly that of the fifth power
+STOP = 25.0  # of k5: the stiffness added at a third of the reach is then mostly that of the fifth power
 
 
 class DuffingStiffness(AbstractEffect):
