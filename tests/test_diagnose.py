@@ -150,14 +150,15 @@ def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(mo
 
 
 @pytest.mark.parametrize(("left", "by_cells", "taken"), [
-    (2.0, ((1.6, 32.0), (1.2, 34.0)), 1.2), (2.0, ((1.9, 30.0), (1.5, 45.0)), None), (1.4, (), None),
+    (2.0, ((1.6, 32.0), (1.2, 34.0), (1.9, 30.0)), 1.2), (2.0, ((1.9, 30.0), (1.5, 45.0), (1.9, 30.0)), None),
+    (2.0, ((1.9, 30.0), (1.5, 45.0), (1.3, 33.0)), 1.3), (1.4, (), None),
 ])  # fmt: skip
-def test_masses_of_cells_serve_a_final_model_where_they_promise_to_foretell_better(bench, monkeypatch, left, by_cells, taken):
+def test_masses_of_cells_or_finer_hats_serve_a_final_model_where_they_promise_to_foretell_better(bench, monkeypatch, left, by_cells, taken):
     """And are not asked for where hats leave little."""
     now, levels = a_fit(left, 60.0), []
     now.choices, now.spectra, now.unknowns = Choices(knots=(26, 18), level=104), (), 30.0
     now.bench, now.problem = bench, SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy", "sensor.offset")))
-    fits = dict(zip((32, 40), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))
+    fits = dict(zip((32, 40, 108), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))
     for found, (_, unknowns) in zip(fits.values(), by_cells, strict=True):
         found.unknowns = unknowns
     monkeypatch.setattr(
