@@ -270,7 +270,7 @@ def solve(
         posed["prior"] = prior_matrix(problem, new)
         return dataclasses.replace(state, cost=cost_of(state.residual, z, posed["prior"]))
 
-    def let_go(chi2):
+    def eased(chi2):
         """Where it stands, lower weights, the state under them, and a path and gains that begin anew."""
         lower = np.maximum(weights / LET_GO, WEIGHT_RANGE[0])
         return chi2, lower, weighed(z, state, lower), [chi2], []
@@ -292,7 +292,7 @@ def solve(
             if missed or stuck:
                 if not (far and evidence and weights.max() > STIFF and chi2 < HELD * held):
                     break
-                held, weights, state, path, gains = let_go(chi2)  # a rough density, held by what was meant for a smooth one
+                held, weights, state, path, gains = eased(chi2)  # a rough density, held by what was meant for a smooth one
                 continue
             stalled = len(gains) >= AT_END[0] and sum(gains[-AT_END[0] :]) < max(AT_END[1], AT_END[2] * state.cost)
             settled = stalled or bool(solver.terminate(residual_at, z, None, posed, state, frozenset())[0])
@@ -305,7 +305,7 @@ def solve(
             elif evidence and settled:
                 # settled far above the noise: as long as the prior, not the physics, holds it there, let go
                 if chi2 < HELD * held and weights.max() > 10 * WEIGHT_RANGE[0]:
-                    held, weights, state, path, gains = let_go(chi2)
+                    held, weights, state, path, gains = eased(chi2)
                     settled = False
             if settled or not state.good:
                 converged = state.decrement < 1.0 + (PROMISED if stalled else 1e-3) * state.cost

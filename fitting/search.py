@@ -59,7 +59,9 @@ SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough 
 
 def screened(result, choices) -> list:
     """Every effect that may be asked for, best first."""
-    return [c for c in screen(result.problem, result.refined) if c.name not in choices.without]
+    found = [c for c in screen(result.problem, result.refined) if c.name not in choices.without]
+    let_go()  # a program an effect, of a density and of other effects that seldom come again
+    return found
 
 
 @dataclasses.dataclass
