@@ -3,32 +3,22 @@
 import json
 import math
 import re
-from pathlib import Path
 
 from . import found as pictures
 from . import learned, loops, misfit, plane, tables
-from .fit_page import AT_NOISE, DEFINED, WORST_AT_NOISE, bounds_of, convergence_part, headed, residual_section, sentence, validity
+from .banner import headline, spoken, tone
+from .fit_page import DEFINED, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
 from .residuals import repeating
 from .style import percent, plain, scale_of, terms_in, unit_text, words
 
-TONES = {
-    "nothing_missing": "good",
-    "attributed": "info",
-    "group": "warn",
-    "absorbed": "warn",
-    "unknown_at": "warn",
-    "data_problem": "bad",
-}
 RUN_PLACEBO = "To run it: magjax diagnose of these recordings with --placebo 20."
 HERE = re.compile(r"; run magjax diagnose on the same files| \(magjax diagnose tells which\)")  # a fit's advice, followed here
-FILE = re.compile(r"(?:^|[.] )(\S+[.]\w+): ")  # that an error begins with
 FRAMED = (
     "The framed block need not be the darkest. The shades are of single effects of the catalogue, to first order; the frame stands where a "
     "smooth function that was fitted jointly with all else foretells recordings left out best, or, of those that foretell them about as well, "
     "where the rest of the model hides it least."
 )
-FORETOLD = 1.4  # times its noise, up to which a check recording is foretold
 SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
 
@@ -82,77 +72,6 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         "headline": "No verdict can be trusted: the fit broke down" if broken and not known else headline(found),
         "message": said, "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
     }  # fmt: skip
-
-
-def spoken(text: str, names) -> str:
-    """A text with the effects' `names` as people say them."""
-    for name in sorted(names, key=len, reverse=True):
-        text = text.replace(name, words(name))
-    return text
-
-
-def tone(found) -> str:
-    """The colour of the banner: a silent verdict over a misfit is a warning."""
-    silent = found["verdict"] == "nothing_missing"
-    return "warn" if silent and still_left(found) else TONES.get(found["verdict"], "bad")
-
-
-def still_left(found) -> str:
-    """What the plain model leaves above the noise of fitted and of check recordings, in words; "" where it is nothing."""
-    said, base = [], found["base"] or {"chi2_per_sample": 0.0, "recordings": []}
-    chi2, worst = base["chi2_per_sample"], max(base["recordings"], key=lambda r: r["chi2_per_sample"], default=None)
-    if chi2 > AT_NOISE:
-        said.append(f"a misfit of χ²/N = {plain(chi2)} is left")
-    elif worst and worst["chi2_per_sample"] > WORST_AT_NOISE:
-        said.append(f"{Path(worst['file']).name} is left with a misfit of χ²/N = {plain(worst['chi2_per_sample'])}")
-    missed = [r for r in found["check"] if r["noise_rms"] and r["rms_after"] > FORETOLD * r["noise_rms"]]
-    if missed:
-        r = max(missed, key=lambda r: r["rms_after"] / r["noise_rms"])
-        fine, unit = scale_of(tables.CHANNEL_OF.get(r["unit"], "displacement"))[2:]
-        said.append(
-            f"a check recording is missed by {plain(fine * r['rms_after'])} {unit} (noise {plain(fine * r['noise_rms'])} {unit})"
-        )
-    return " and ".join(said)
-
-
-def headline(found) -> str:
-    """The verdict in plain words."""
-    verdict = found["verdict"]
-    if verdict == "attributed":
-        names = " and ".join(f"{words(e['name'])} ({e['block']})" for e in found["effects"])
-        return f"Found what the model leaves out: {names}"
-    if verdict == "group":
-        names = "; ".join(" or ".join(words(n) for n in g) for g in found["groups"])
-        beside = ", ".join(f"{words(e['name'])} ({e['block']})" for e in found["effects"])
-        found_beside = f"; found beside it: {beside}" if beside else ""
-        return f"Something is missing, and these recordings cannot say which: {names}{found_beside}"
-    if verdict == "nothing_missing" and (left := still_left(found)):
-        return f"No effect of the catalogue was found{_judged(found)}; {left}"
-    if verdict == "unknown_at":
-        where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
-        return f"Something is missing that no effect of the catalogue explains; it acts most like the block {where}"
-    return {
-        "nothing_missing": "Nothing is missing: the model meets the recordings to their noise",
-        "absorbed": "What may be missing cannot show in these recordings: the density absorbs it",
-        "data_problem": f"{_at_fault(found)} must be mended first; no physics is judged",
-    }.get(verdict, words(verdict))
-
-
-def _at_fault(found) -> str:
-    """What a data problem asks to be mended."""
-    text = f"{found['message']} {found['data_problem'] or ''}"
-    bench = "[columns" in text or "bench file" in text
-    files = list(dict.fromkeys(Path(name).name for name in FILE.findall(text)))
-    if bench and (files or "leave it out" in text):
-        return "The recordings or the bench file"
-    return "The bench file" if bench else " and ".join(files) or "The recordings"
-
-
-def _judged(found) -> str:
-    """How many effects could be judged: the density does not hide them."""
-    number = len(found["candidates"])
-    absorbed = {c["name"] for c in found["candidates"]} & set(found["absorbed"])
-    return f" ({number - len(absorbed)} of {number} could be judged)" if number else ""
 
 
 def _doubt(fit) -> str:

@@ -15,7 +15,8 @@ import pytest
 
 from fitting.locate import where
 from fitting.report import rebuild, store, write_diagnosis
-from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, headline, interval, placebo_section, tone
+from fitting.report.banner import headline, tone
+from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, interval, placebo_section
 from fitting.report.fit_page import diagnose_command, sentence, validity
 from fitting.report.learned import learned_function
 from fitting.report.loops import inside, loops
@@ -439,6 +440,8 @@ def test_a_file_that_cannot_be_used_is_shown_and_the_others_are_told(tmp_path, r
     ("problem", "fault"),
     [
         ("r.csv: the reading drifts by 3 through the record; let it warm up", "r.csv"),
+        ("my rod.csv: the reading drifts by 3 through the record. b.2.csv: it is clipped", "my rod.csv and b.2.csv"),
+        ("the drive reaches 3.2: out of the plane", "The recordings"),
         ("the periods do not repeat: in most recordings the last differs", "The recordings"),
         (
             "the reading falls where the drive rises: the sign of a channel is swapped; set scale = -1 in [columns]",
