@@ -33,6 +33,7 @@ REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
 REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be the density
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
+ASTRAY = 1e3  # chi2/N from which the signs of M in the loops that a fit began with are in doubt
 LOST, AT_BOUND = 1e5, 100.0  # chi2/N from which a fit has led nowhere, and one with a parameter at its bound
 VALLEY = 0.98  # correlation from which two parameters are one
 LEARNED = "effects.learned_term."  # its coefficients are many, and held by their prior on purpose: none is named by itself
@@ -83,7 +84,11 @@ def fit(
     )
     compiled(problem, z)
     warm = time.perf_counter() - begin
-    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target)
+    asked = choices
+    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, asked, spectra, start, report, target)
+    if start is None and solution.chi2 > ASTRAY * problem.data_count and not solution.interrupted:
+        found = _with_turning(z, solution, actuator, bench, names, asked, spectra, report, target)
+        problem, solution, choices = found or (problem, solution, choices)
     if refine and choices.knots is not None and not solution.interrupted:
         highest = REFINE_MATERIAL if bench.drive != "current" else REFINE_BESIDE if actuator.effects else REFINE_BELOW
         highest = highest if refine is True else refine
@@ -177,6 +182,17 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
         if settled:
             break
     return best[:3]
+
+
+def _with_turning(z, solution, actuator, bench, names, choices, spectra, report, target):
+    """The fit from loops whose M may turn its sign wherever the strain comes near zero, where that begins elsewhere and ends lower;
+    None elsewhere. The strain goes by M^2: with the wrong sign of a loop's M no density serves, and no step leads to the right one."""
+    again = dataclasses.replace(choices, touching=True)
+    posed = build_problem(spectra, actuator, bench, names, dataclasses.replace(again, rest=rests_of(bench, again)[0][0]))
+    if choices.touching or np.array_equal(z, posed[1]):
+        return None
+    found = _start_memories(*posed, actuator, bench, names, again, spectra, None, report, target)
+    return found if found[1].chi2 < solution.chi2 else None
 
 
 def _apart(rests, problem):
@@ -360,7 +376,7 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
     if solution.interrupted:
         return f"interrupted after {solution.jacobians} Jacobians; this is what was reached: give it as --model to go on from its constants"
     if not chi2n < LOST:
-        wrong = swapped(problem.spectra) or "check signs and units of the recordings, and the bench file"
+        wrong = swapped(problem.spectra, rows) or "check signs and units of the recordings, and the bench file"
         named = Path(max(rows, key=lambda r: np.nan_to_num(r.chi2_per_sample, nan=np.inf)).file).name
         size = (
             f"what repeats is {np.sqrt(chi2n):.3g} times its noise"

@@ -11,6 +11,7 @@ from .model import Predictor, predicted_lines
 from .record_level import drift_of
 from .spectra import fit_lines
 
+MISSED_SHARE = 0.4  # of a reading that changes sign in one recording alone: its rms about its mean that a fit of all misses
 SWAPPED, ONE_SWAPPED = 20.0, 1e4  # chi2/N from which a sign may be swapped: in all recordings, in one (loops may turn about zero M)
 MOST = 0.8  # share of the recordings that must show it
 RESTLESS = 5.0  # mean square of the first period between its harmonics over the white noise
@@ -96,15 +97,21 @@ def _changes(blocks):
     return first, float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if len(blocks) > 2 else 0.0
 
 
-def swapped(spectra, each: bool = True) -> str | None:
-    """That the sign of a channel is swapped, in words: in all recordings, by the slowest, or in one that no faster one bears out."""
+def swapped(spectra, fits=()) -> str | None:
+    """That the sign of a channel is swapped, in words: in all recordings, by the slowest, or in one that no faster one bears out.
+
+    `fits`: the `RecordingFit` of each, where one alone may be: it must be missed by a part of itself, for about no field, where
+    the strain goes by M^2, a reading may well move against the drive.
+    """
     lags = [-float(np.angle(s.reading[1] / s.drive[1])) if len(s.reading) > 1 and abs(s.drive[1]) > 0 else None for s in spectra]
     known = [(s.frequency, lag) for s, lag in zip(spectra, lags, strict=True) if lag is not None]
     slowest = min((f for f, _ in known), default=0.0)
     slow = [lag for f, lag in known if f <= 1.01 * slowest]
     if slow and all(abs(lag) > 0.75 * np.pi for lag in slow):
         return "the reading falls where the drive rises at the lowest frequency: the sign of a channel is swapped; set scale = -1 in [columns]"
-    for s, lag in zip(spectra, lags, strict=True) if each else ():
+    for s, lag, row in zip(spectra, lags, fits, strict=True) if fits else ():
+        if row.residual_rms < MISSED_SHARE * np.sqrt(2 * np.sum(np.abs(s.reading[1:]) ** 2)):
+            continue
         # a reading lags, the more the faster; swapped it leads, or lags by half a turn
         faster = [other for f, other in known if f > s.frequency and 0 < other < 0.9 * np.pi]
         if lag is not None and faster and not -0.15 * np.pi < lag < max(faster) + 0.15 * np.pi:
@@ -115,4 +122,4 @@ def swapped(spectra, each: bool = True) -> str | None:
 def wrong_bench(result) -> str | None:
     """A bench file that cannot be this bench: swapped sign of the reading."""
     chi2n = result.chi2_per_sample
-    return None if chi2n <= SWAPPED else swapped(result.spectra, not chi2n <= ONE_SWAPPED)  # a fit that broke down too
+    return None if chi2n <= SWAPPED else swapped(result.spectra, () if chi2n <= ONE_SWAPPED else result.recordings)  # a fit that broke down too

@@ -38,6 +38,7 @@ class Choices:
     max_jacobians: int = 30
     without: tuple[str, ...] = ()  # effects that a diagnosis does not ask for: their instrument was measured
     rest: str = "auto"  # start memory: "negative", "demagnetized" about the drive's zero, "virgin": about no field, "positive", or tried in turn
+    touching: bool = False  # start from loops whose M may turn its sign wherever the strain comes near zero
 
 
 def spectra_of(recordings, bench, harmonics: int = HARMONICS):
@@ -148,7 +149,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     if held:
         start = np.asarray([(actuator.hysteresis.offset - actuator.hysteresis.masses.sum()) / total])
     elif start is None or len(start) != basis.cells.shape[1] + 1:
-        x, bottom, _ = equation_error_start(basis, spectra, full, starter, rest=rest)
+        x, bottom, _ = equation_error_start(basis, spectra, full, starter, rest=rest, touching=choices.touching)
         start = np.append(x, bottom)
     known = actuator.parameters()
     values = [float(known[n][0]) for n in names]

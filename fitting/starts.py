@@ -14,6 +14,7 @@ from .solver import bounded_minimum
 from .spectra import evaluate_lines
 
 NEAR_ZERO = 0.3  # of the largest |M|, below which it may change sign
+TOUCHING = 0.03  # of the largest strain, below which it may be taken for none
 SIGNS = 50  # instants of a period at which the sign of M is sought
 
 
@@ -75,9 +76,13 @@ def unreached_row(basis, highest, lowest, rest):
     return 2 * (np.tril(share) * (1 + np.eye(basis.size))).ravel() @ basis.cells
 
 
-def inferred_loops(spectra, deviations, actuator, samples: int = 200):
-    """Field and magnetization over a period from the reading, by (4) and (5) backwards: lists of (H, M, trust)."""
-    loops = []
+def inferred_loops(spectra, deviations, actuator, samples: int = 200, touching: bool = False):
+    """Field and magnetization over a period from the reading, by (4) and (5) backwards: lists of (H, M, trust).
+
+    `touching`: a strain that comes near zero is taken to reach it there, so that M may turn its sign: what keeps the rod from
+    coming back (friction, a strain that lags) hides that it does.
+    """
+    loops, highest = [], max(np.abs(evaluate_lines(s.reading, np.arange(samples) / samples)).max() for s in spectra)
     phases = np.arange(samples) / samples
     coil, mechanics = in_numpy(actuator.coil), in_numpy(actuator.mechanics)
     for s, sigma in zip(spectra, deviations, strict=True):
@@ -92,6 +97,7 @@ def inferred_loops(spectra, deviations, actuator, samples: int = 200):
             gain = mechanics.response(w) if mechanics is not None else np.ones(count)
             lines = np.where(np.abs(gain) > 0.05, lines / gain, 0.0)
             free = evaluate_lines(lines, phases)
+            free = free - free.min() if touching and actuator.piezo is None and free.min() < TOUCHING * highest else free
             share, M_s = free / float(actuator.strained.reach), float(actuator.strained.M_s)
             even = actuator.piezo is None  # the strain of a rod hides the sign of M
             M = M_s * (unfold(np.sqrt(np.maximum(share, 0.0)), applied) if even else share - _reversible(actuator, applied))
@@ -163,18 +169,26 @@ def agreeing(ranges, turned) -> list[int]:
     return kept
 
 
-def equation_error_start(basis, spectra, deviations, actuator, max_frequency=None, rest=None):
+def equation_error_start(basis, spectra, deviations, actuator, max_frequency=None, rest=None, touching=False):
     """Density unknowns and the bottom of M from the slower half of the recordings: (x, bottom / total, misfit).
 
     `max_frequency`: take all recordings (any value but None). `misfit`: rms of the weighted equation error, relative.
-    `rest`: field about which the material was demagnetized, A/m; None for negative saturation.
+    `rest`: field about which the material was demagnetized, A/m; None for negative saturation. `touching`: as of `inferred_loops`.
     """
     order = np.argsort([s.frequency for s in spectra])
     chosen = order[: max(2, (len(order) + 1) // 2)] if max_frequency is None else order
     spectra = [spectra[k] for k in chosen]
-    loops = inferred_loops(spectra, [deviations[k] for k in chosen], actuator)
+    loops = inferred_loops(spectra, [deviations[k] for k in chosen], actuator, touching=touching)
     drives = [s.drive_at(np.arange(200) / 200) for s in spectra]
-    loops = [loops[k] for k in agreeing([(d.min(), d.max()) for d in drives], [bool(M.min() < 0) for _, M, _ in loops])]
+    turned = [bool(M.min() < 0) for _, M, _ in loops]
+    # a loop that was taken to reach zero and does not turn there is in doubt: others that do know better
+    sure = (
+        [t or not (touching and M.min() == 0) for t, (_, M, _) in zip(turned, loops, strict=True)]
+        if any(turned)
+        else [True] * len(loops)
+    )
+    known = [k for k in agreeing([(d.min(), d.max()) for d in drives], turned) if sure[k]]
+    loops = [loops[k] for k in known]
     rows, values = [], []
     for H, M, trust in loops:
         step = (basis.high - basis.low) / basis.size

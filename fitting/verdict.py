@@ -32,6 +32,7 @@ PROMISES = 8.0  # times the Newton decrement, that going on with a fit may gain 
 DOMINANT_TEXT = " What is left is the form of its law, or something weaker beside it: no other effect takes nearly as much."
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 NO_BETTER = (3.0, 10.0, 0.8)  # chi2/N and check recordings' misfit from which what explains the one must lower the other to this share
+SURE_Z, SURE_WORSE = 12.0, 1.5  # score from which what meets the noise may foretell so much worse: where a density that no recording told of is in the way
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
@@ -205,7 +206,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         first = first_alone(evidence)
         return verdict(first) if first is not None else _unknown(evidence, common)
-    if steps and after > WORSE[0] * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
+    times = SURE_WORSE if sure(evidence) else WORSE[0]
+    if steps and after > times * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     if steps and far_off and after > NO_BETTER[2] * before:
@@ -233,6 +235,13 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
             form += CREEPS_TEXT
     form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
+
+
+def sure(evidence) -> bool:
+    """Whether what was found meets the noise, and each of it scored as no density does: what check recordings ask of cells that
+    no recording switched moves by chance."""
+    scores = [abs(best.candidate.z) for best, *_ in evidence.reached.steps]
+    return not evidence.missing and min(scores, default=0.0) > SURE_Z
 
 
 def dominant(evidence) -> bool:
@@ -345,8 +354,9 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
     region = f"{evidence.bench.terms.field} quarter {int(np.argmax(fields)) + 1} of 4" if fields else ""
     steps = evidence.reached.steps
     best = steps[0][0].name if steps else (common["candidates"][0].name if common["candidates"] else "none")
+    nothing = "that no effect of the catalogue both explains and foretells" if note else "that no effect of the catalogue explains"
     text = (
-        f"something is missing that no effect of the catalogue explains (chi2/N = {evidence.excess:.3g} at best; {best} comes nearest and explains "
+        f"something is missing {nothing} (chi2/N = {evidence.excess:.3g} at best; {best} comes nearest and explains "
         f"{max(evidence.share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."
     )
     unknown = {"block": block, "region": region, "explained_share": float(np.clip(evidence.share, 0, 1))}

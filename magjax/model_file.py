@@ -51,6 +51,7 @@ def _model(content):
         raise ConfigurationError(f"parameters lacks {', '.join(missing)}")
     masses = np.asarray(plane["masses"], float)
     numbers = {**stated, **{f"hysteresis.{k}": plane[k] for k in ("low", "high", "offset")}, "hysteresis.masses": masses.sum()}
+    numbers["hysteresis.history"] = np.asarray(plane["history"], float).sum()
     if odd := [name for name, value in numbers.items() if not np.isfinite(value)]:
         raise ConfigurationError(f"{odd[0]} is not a finite number")
     for name, (_, info) in known.items():

@@ -350,6 +350,19 @@ def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, 
     assert module.verdict(evidence).verdict == word
 
 
+@pytest.mark.parametrize(("z", "left", "found"), [(18.8, 0.95, True), (8.0, 0.95, False), (18.8, 1.4, False)])
+def test_what_meets_the_noise_and_scores_high_is_sure(z, left, found):
+    """A friction of 0.2 % that scored 18.8 took all of a misfit, and foretold check recordings a little worse that were missed by five
+    times their noise before."""
+    from fitting.verdict import sure
+
+    best = trial("coulomb_friction", left, base=1.49)
+    best = dataclasses.replace(best, candidate=dataclasses.replace(best.candidate, z=z))
+    fits = SimpleNamespace(chi2_per_sample=left, data_count=COUNT), SimpleNamespace(chi2_per_sample=1.49, data_count=COUNT)
+    evidence = SimpleNamespace(reached=Reached(fits[0], [(best, [], [], fits[1])], {}), missing=left > 1.15)
+    assert sure(evidence) == found
+
+
 def searched(monkeypatch, ends, follows):
     """`search._of_two` with trials that end at chi2/N `ends`; `follows`: after each the best score, and where a fit of it ends."""
     trials = [trial(n, x, base=110.0, direction=d) for n, x, d in ends]

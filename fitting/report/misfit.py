@@ -148,6 +148,7 @@ def _branches(axes, found, key, terms):
         )
     if key == "rate":
         axes.set_xscale("log")
+        plain_ticks(axes, "x")
         axes.set_xlabel(f"|d{terms.field_letter}/dt| applied / ({terms.unit}/s)")
     else:
         axes.set_xlabel(f"{terms.applied} / {per(unit)}")

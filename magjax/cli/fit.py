@@ -45,10 +45,28 @@ def _bench_and_start(options):
         from magjax.model_file import load_model
 
         actuator, bench = load_model(options.model)
-        return (told(load_bench(options.bench)) if options.bench else bench), actuator
+        return (told(load_bench(options.bench)) if options.bench else bench), _on_bench(actuator, options.bench)
     if not options.bench:
         raise ConfigurationError("give --bench (a TOML file or aa-050h), or --model with a fitted folder")
     return told(load_bench(options.bench)), None
+
+
+def _on_bench(actuator, named):
+    """A model's actuator with the fixed constants of the bench that is named beside it: those of its coil and its rod; differences are told."""
+    from magjax.bench import load_bench
+
+    bench = load_bench(named) if named else None
+    known = actuator.parameters()
+    fixed = {
+        n: v
+        for n, v in (bench.constants if bench else {}).items()
+        if n in known and n.split(".")[0] in ("coil", "magnetostriction")
+    }
+    other = {n: v for n, v in fixed.items() if n not in bench.free and abs(float(known[n][0]) - v) > 1e-9 * abs(v)}
+    if other:
+        said = ", ".join(f"{n} = {v:g} ({float(known[n][0]):g} in the model)" for n, v in other.items())
+        print(f"--bench and --model differ; the bench holds: {said}", file=sys.stderr)
+    return actuator.replace(other) if other else actuator
 
 
 def _common(command, text, example, recordings="+"):

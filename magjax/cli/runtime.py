@@ -42,6 +42,13 @@ def positive(text: str) -> int:
     return int(text)
 
 
+def seed(text: str) -> int:
+    """A whole number of zero or more, for an option's `type`."""
+    if int(text) < 0:
+        raise ValueError
+    return int(text)
+
+
 def parser(command: str, text: str, example: str) -> Parser:
     """A parser with the common options."""
     made = Parser(
@@ -52,7 +59,7 @@ def parser(command: str, text: str, example: str) -> Parser:
     )
     made.add_argument("--json", action="store_true", help="print the result as JSON on stdout; progress goes to stderr")
     made.add_argument("--quiet", action="store_true", help="no progress")
-    made.add_argument("--seed", type=int, default=0, help="seed of everything random (default 0)")
+    made.add_argument("--seed", type=seed, default=0, help="seed of everything random (default 0)")
     return made
 
 

@@ -7,6 +7,7 @@ from magjax.errors import ConfigurationError
 from .runtime import Progress, as_json, output_folder, parser, prepare_jax, refuse_overwriting, told
 from .scale import add_where, executor_of
 
+MOST_SAMPLES = 1_000_000  # of a period
 MOST_VALUES = 1_000_000  # along one axis of a sweep
 
 
@@ -19,6 +20,8 @@ def _actuator(options):
     if options.model is not None:
         from magjax.model_file import load_model
 
+        if options.bench:
+            raise ConfigurationError("--bench and --model: a model holds its bench; give one of the two")
         return load_model(options.model)
     from magjax.bench import load_bench
 
@@ -87,8 +90,8 @@ def run_simulate(arguments) -> int:
         refuse_overwriting(path, options.drive)
         drive, dt, periodic = _drive_of(options.drive, bench)
     else:
-        if options.samples < 20 or not options.frequency > 0:
-            raise ConfigurationError("give --frequency above zero and --samples of 20 or more")
+        if not 20 <= options.samples <= MOST_SAMPLES or not 0 < options.frequency < np.inf:
+            raise ConfigurationError(f"give --frequency above zero and --samples of 20 to {MOST_SAMPLES}")
         phase = 2 * np.pi * np.arange(options.samples) / options.samples
         drive = options.offset + options.amplitude * np.sin(phase)
         dt, periodic = 1 / (options.frequency * options.samples), True
