@@ -35,6 +35,7 @@ CALM = 0.25  # mean square of the recordings' levels in units of their prior, ab
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 ASTRAY = 1e3  # chi2/N from which the signs of M in the loops that a fit began with are in doubt
 LOST, AT_BOUND = 1e5, 100.0  # chi2/N from which a fit has led nowhere, and one with a parameter at its bound
+SLOW, MOST_STROKE = 0.3, 1.1  # of f0, below which a rod moves as its strain does; of the rod's reach, that noise may add
 VALLEY = 0.98  # correlation from which two parameters are one
 LEARNED = "effects.learned_term."  # its coefficients are many, and held by their prior on purpose: none is named by itself
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
@@ -297,6 +298,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.in
         + valleys(related)
         + unsettled(problem.spectra)
         + guessed(recordings, bench)
+        + beyond_the_rod(problem.spectra, fitted, bench)
         + _contradicted(bench, choices)
     )
     lost = not chi2n < LOST or (chi2n > AT_BOUND and any(e.at_bound and not e.name.startswith("effects.") for e in rows))
@@ -305,6 +307,20 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.in
         effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
         problem.spectra, choices,
     )  # fmt: skip
+
+
+def beyond_the_rod(spectra, actuator, bench) -> str:
+    """That a reading moves further than the rod can, in words, by recordings too slow for its resonance."""
+    if bench.output != "displacement" or actuator.piezo is not None or actuator.mechanics is None:
+        return ""
+    reach, slow = float(actuator.strained.reach), SLOW * float(actuator.mechanics.f0)
+    stroke = max((s.peak_to_peak for s in spectra if s.frequency < slow), default=0.0)
+    if stroke <= MOST_STROKE * reach:
+        return ""
+    return (
+        f"; the reading moves by {stroke:.3g} m, and the rod gives {reach:.3g} m at most (lambda_s l_rod): no parameter is physical; "
+        "set scale or unit in [columns.displacement], or lambda_s and l_rod of the bench"
+    )
 
 
 def _contradicted(bench, choices) -> str:

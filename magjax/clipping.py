@@ -14,6 +14,7 @@ import numpy as np
 from .errors import RecordingError
 from .plausibility import UNITS, si_unit
 
+RESTING, MOVES = 0.1, 0.3  # of the samples at the highest or lowest value, from which the noise is taken between: so many must be there
 FEWEST = 5  # samples that rest: an honest crest leaves two equal ones on its top, three with some luck
 MOST_JUDGED = 16  # crests, evenly over the record
 ARCH = 4.0  # hidden height in tolerances; one where the crest is a parabola, two for t^4
@@ -63,7 +64,12 @@ def _in_noise(values: np.ndarray) -> float:
     if len(values) < 4 * FEWEST:
         return 0.0
     # by eighth differences: a smooth signal has none to speak of, down to ten samples a swing
-    noise = float(np.quantile(np.abs(np.diff(values, 8)), 0.25) / (0.3186 * np.sqrt(12870)))
+    moving = np.abs(np.diff(values, 8))
+    resting = (values == values.max()) | (values == values.min())
+    if resting.mean() > RESTING:  # cut with their noise, or a signal that rests: by what is between
+        between = ~np.lib.stride_tricks.sliding_window_view(resting, 9).any(axis=1)
+        moving = moving[between] if between.mean() > MOVES else moving
+    noise = float(np.quantile(moving, 0.25) / (0.3186 * np.sqrt(12870)))
     return noise if noise > max(NOISY * quantum(values), SEEN * np.ptp(values)) else 0.0
 
 

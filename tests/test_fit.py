@@ -16,7 +16,7 @@ import magjax.bench
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import DensityBasis, cell_basis, hat_basis
-from fitting.fit import cells_beside, finer_hats, finer_than, fit, guessed, loose, valleys
+from fitting.fit import beyond_the_rod, cells_beside, finer_hats, finer_than, fit, guessed, loose, valleys
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices
 from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
@@ -60,6 +60,13 @@ def test_reaches_the_noise_and_the_constants(result):
         assert abs(estimate.value / true - 1) < 0.01
     assert "noise" in result.message
     assert "coil.R_eddy" in str(result)
+
+
+@pytest.mark.parametrize(("stroke", "frequency", "told"), [(6e-5, 10.0, False), (9e-5, 10.0, True), (9e-5, 300.0, False)])
+def test_a_reading_beyond_the_rod_is_told(bench, stroke, frequency, told):
+    """1.5 times too large a reading was met to its noise, with R_eddy 76 for 62; near its resonance a rod may move further."""
+    said = beyond_the_rod([SimpleNamespace(peak_to_peak=stroke, frequency=frequency)], bench.actuator(), bench)
+    assert ("scale or unit in [columns.displacement]" in said) == told
 
 
 @pytest.mark.long

@@ -112,6 +112,15 @@ def test_crests_cut_with_their_noise_by_little_are_clipped(bits):
     assert is_clipped(counted(np.minimum(x, level), bits)) and not is_clipped(counted(x, bits))
 
 
+@pytest.mark.parametrize("bits", [16, None])
+@pytest.mark.parametrize("below", [0.02, 0.03, 0.05, 0.08, 0.15])
+def test_a_saturated_crest_cut_with_its_noise_is_clipped(below, bits):
+    """More than a third of the samples at the limit hid how far the others scatter."""
+    noise = 7e-4 * np.random.default_rng(4).standard_normal(4000)
+    x = 0.45 * np.tanh(2 * np.sin(2 * np.pi * phases(1000, 4)) + 1) + noise
+    assert is_clipped(counted(np.minimum(x, x.max() - below * np.ptp(x)), bits)) and not is_clipped(counted(x, bits))
+
+
 @pytest.mark.parametrize("samples", [12, 20, 50, 200])
 def test_a_sine_without_noise_reaches_its_crest_in_every_period(samples):
     x = np.sin(2 * np.pi * (np.arange(40 * samples) % samples) / samples)
