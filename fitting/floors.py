@@ -109,7 +109,7 @@ def swapped(spectra, fits=()) -> str | None:
     slow = [lag for f, lag in known if f <= 1.01 * slowest]
     if slow and all(abs(lag) > 0.75 * np.pi for lag in slow):
         return "the reading falls where the drive rises at the lowest frequency: the sign of a channel is swapped; set scale = -1 in [columns]"
-    for s, lag, row in zip(spectra, lags, fits, strict=True) if fits else ():
+    for s, lag, row in zip(spectra, lags, fits, strict=False):  # none, where one alone is not asked for
         if row.residual_rms < MISSED_SHARE * np.sqrt(2 * np.sum(np.abs(s.reading[1:]) ** 2)):
             continue
         # a reading lags, the more the faster; swapped it leads, or lags by half a turn

@@ -15,7 +15,7 @@ TONES = {
     "unknown_at": "warn",
     "data_problem": "bad",
 }
-FILE = re.compile(r"(?:^|[.] )([^:]+?[.][A-Za-z]\w*): ")  # that an error begins with
+FILE = re.compile(r"(?:^|[.] )((?:(?![.] )[^:])+?[.][A-Za-z]\w*): ")  # that an error begins with
 FORETOLD = 1.4  # times its noise, up to which a check recording is foretold
 
 
