@@ -181,13 +181,9 @@ def equation_error_start(basis, spectra, deviations, actuator, max_frequency=Non
     loops = inferred_loops(spectra, [deviations[k] for k in chosen], actuator, touching=touching)
     drives = [s.drive_at(np.arange(200) / 200) for s in spectra]
     turned = [bool(M.min() < 0) for _, M, _ in loops]
-    # a loop that was taken to reach zero and does not turn there is in doubt: others that do know better
-    sure = (
-        [t or not (touching and M.min() == 0) for t, (_, M, _) in zip(turned, loops, strict=True)]
-        if any(turned)
-        else [True] * len(loops)
-    )
-    known = [k for k in agreeing([(d.min(), d.max()) for d in drives], turned) if sure[k]]
+    known = agreeing([(d.min(), d.max()) for d in drives], turned)
+    if touching and any(turned):  # of a loop that was taken to reach zero and does not turn there, others know better
+        known = [k for k in known if turned[k] or loops[k][1].min() > 0]
     loops = [loops[k] for k in known]
     rows, values = [], []
     for H, M, trust in loops:

@@ -12,7 +12,7 @@ NUMPY_ONLY = (
     *("magjax/control", "magjax/inverse", "magjax/acquire"),
     *(
         f"magjax/{name}.py"
-        for name in "pickup recording readers writers inspection instruments waveforms bench extrema clipping plausibility".split()
+        for name in "pickup recording readers formats columns writers inspection instruments waveforms bench extrema clipping plausibility".split()
     ),
 )
 SOURCES = sorted([*ROOT.glob("magjax/**/*.py"), *ROOT.glob("fitting/**/*.py")])

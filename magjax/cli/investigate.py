@@ -77,7 +77,7 @@ def analysis(bench, folder, options, live):
             found,
             recordings,
             content,
-            shlex.join(["magjax", "diagnose", *map(str, files), "--bench", str(options.bench), *(["--check", *map(str, checks)] if checks else [])]),
+            shlex.join(map(str, ["magjax", "diagnose", *files, "--bench", options.bench, *(["--check", *checks] if checks else [])])),
             held,
             bench=bench,
             shown=shown,

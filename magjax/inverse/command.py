@@ -114,12 +114,13 @@ def read_trajectory(path, columns=None):
 
     `columns`: a bench's column map; it holds for the columns that are there by its names, others go by the usual names.
     """
-    from ..readers import USUAL, _column, _find, _read_csv
+    from ..columns import USUAL, column_of, quantity_of
+    from ..formats import read_csv
 
     if not path.exists():
         raise RecordingError(f"{path}: no such file; check the name")
     try:
-        table, _ = _read_csv(path)
+        table, _ = read_csv(path)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise RecordingError(f"{path}: cannot be read as CSV ({reason}); give a table with time_s and displacement_m") from None
@@ -128,9 +129,9 @@ def read_trajectory(path, columns=None):
         mapped = (columns or {}).get(quantity, {})
         if mapped.get("name") not in table:
             mapped = {}
-        if _column(path, table, quantity, mapped)[0] is None:
+        if column_of(path, table, quantity, mapped)[0] is None:
             raise RecordingError(f"{path}: no {quantity} column among {', '.join(table)}; name it {USUAL[quantity]}")
-        found.append(_find(path, table, quantity, mapped, required=True))
+        found.append(quantity_of(path, table, quantity, mapped, required=True))
     time, wanted = found
     steps = np.diff(time)
     if len(time) < 4 or not np.all(np.isfinite(wanted)) or not np.all(np.isfinite(time)):

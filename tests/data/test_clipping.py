@@ -8,7 +8,8 @@ import pytest
 from magjax.bench import load_bench
 from magjax.clipping import clipped_crest, cut_in_noise, quantum, refuse_clipping, stuck_stretch
 from magjax.errors import RecordingError
-from magjax.readers import _read_csv, load_recordings
+from magjax.formats import read_csv
+from magjax.readers import load_recordings
 from magjax.recording import Recording
 
 BITS = (8, 12, 16, None)
@@ -197,7 +198,7 @@ def test_a_cut_crest_is_seen_before_a_gap_in_it_is_filled(tmp_path):
 
 def test_measured_channels_are_not_clipped(measured):
     for path in sorted((measured / "rod_eddy").glob("captures_*.csv")):
-        table, _ = _read_csv(path)
+        table, _ = read_csv(path)
         for capture in np.unique(table["capture"]):
             for column in ("v_shunt_V", "v_pickup_V"):
                 assert not is_clipped(table[column][table["capture"] == capture]), (path.name, capture, column)

@@ -14,7 +14,7 @@ from fitting.uncertainty import Estimate
 from magjax.bench import load_bench
 from magjax.inspection import Card
 from magjax.page import deliver, table
-from magjax.readers import UNITS
+from magjax.plausibility import UNITS
 from magjax.writers import NAMES
 
 from .meanings import CHECK, DIAGNOSIS, FIT, INNER, MODEL, NAMED
