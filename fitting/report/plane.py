@@ -47,6 +47,7 @@ def mass_map(evidence, stem: str = "masses", doubt: str = ""):
         )
         if known:
             caption += f" Of the switched mass {percent(well)} is in cells whose standard error is below 30 %{f' (errors {doubt})' if doubt else ''}."
+            caption += " Errors swing with the knots of the density, and are none where a mass is held at zero."
         return picture(figure, stem, "Preisach masses and their standard errors", caption)
 
 
