@@ -61,7 +61,8 @@ UNPROMISED = 3.0  # times what any effect promised, that effects take where the 
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.5  # of a misfit, that a finer density may leave where the first one was too coarse
 LEAVES_MISFIT = 2.0  # chi2/N beside an effect that was named, from which a learned function is tried in its place
-MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own
+MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
+EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -117,7 +118,7 @@ def _with_missed_check(task, found, check) -> Diagnosis:
         return found
     if not (found.repaired or found.base).chi2_per_sample < MISFIT:
         return found
-    ratios = [r["rms_after"] / r["noise_rms"] if r["noise_rms"] and not r["beyond_plane"] > BEYOND else 0.0 for r in found.check]
+    ratios = [_surprise(r) for r in found.check]
     if not max(ratios, default=0.0) > MISSED:
         return found
     worst = int(np.argmax(ratios))
@@ -136,6 +137,13 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     row = {**found.check[worst], "rms_after": again.repaired.recordings[-1].residual_rms, "joined": True}
     again = dataclasses.replace(again, check=(*again.check[:worst], row, *again.check[worst:]))
     return again.noted(f"Without it among the recordings {told}; it joined them.")
+
+
+def _surprise(row) -> float:
+    """How many times its noise a check recording is missed by; 0 where the fit expected as much, or its drive leaves the plane."""
+    if not row["noise_rms"] or row["beyond_plane"] > BEYOND or row["rms_after"] < EXPECTED * (row.get("expected_rms") or 0.0):
+        return 0.0
+    return row["rms_after"] / row["noise_rms"]
 
 
 def _says_more(again, found) -> bool:

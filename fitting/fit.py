@@ -10,6 +10,7 @@ import numpy as np
 
 from magjax.bench import load_bench
 from magjax.plausibility import si_unit
+from magjax.recording import stray_samples
 from magjax.simulate import require_x64
 
 from .floors import swapped
@@ -298,6 +299,7 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.in
         + valleys(related)
         + unsettled(problem.spectra)
         + guessed(recordings, bench)
+        + strayed(recordings)
         + beyond_the_rod(problem.spectra, fitted, bench)
         + _contradicted(bench, choices)
     )
@@ -377,6 +379,15 @@ def guessed(recordings, bench) -> str:
     if not number:
         return ""
     return f"; the noise of {number} of {len(recordings)} recordings is a guess from their highest orders: record three or more periods"
+
+
+def strayed(recordings) -> str:
+    """Single samples that were put where the other periods are, in words."""
+    found = {Path(r.name).name: stray_samples(r)[0] for r in recordings if stray_samples(r)[0]}
+    if not found:
+        return ""
+    told = ", ".join(f"{name} ({number})" for name, number in list(found.items())[:3])
+    return f"; samples that stood far off alone were left out: {told}{' and others' if len(found) > 3 else ''}"
 
 
 def unsettled(spectra) -> str:

@@ -35,6 +35,7 @@ from .attribute import (
 )
 from .check import check_errors
 from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, rests_of
+from .foretold import Foreteller
 from .instruments import RINGING, mode_as_filter
 from .rows import SLOW
 from .screen import screen
@@ -54,7 +55,8 @@ FORM_ERROR = 0.005  # of what the effects found take: as little as that is left 
 NEAR_SHARE = 0.25  # of an early effect's fall, within which too
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
-SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7
+SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7; check recordings
+# that say for it count as much
 
 
 def screened(result, choices) -> list:
@@ -68,27 +70,33 @@ def screened(result, choices) -> list:
 class Reached:
     """The current fit, adopted trials with their rivals, all trials of the last round.
 
-    `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were.
+    `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were;
+    `foretell`: what fits say of the check recordings.
     """
 
     current: object
     steps: list
     tried: dict
     form: str | None = None
+    foretell: Foreteller | None = None
 
 
 def search(task, base, candidates, check=(), ends=lambda current: False, free_means=lambda fit, best: False) -> Reached:
     """Forward: fit the leaders, adopt the best while it earns its place; then screen again. `task`: a `Task`, of what
     `base` was fitted to; `ends(fit)`: whether the fit with an effect that was adopted makes the rest of the search needless;
     `free_means(fit, best)`: the same of that with a slow effect, whose means are not settled, beside the best."""
-    state = Reached(base, [], {})
+    foretell = Foreteller(check, base)
+    state = Reached(base, [], {}, foretell=foretell)
     scored = {c.name: c for c in candidates}
-    any_rest = task.choices.rest == "auto"
+    any_rest, made_up = task.choices.rest == "auto", None
     task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
         calm = state.steps and state.current.chi2_per_sample < SILENT_CHI2
-        if not top or abs(top[0].z) < (SECOND_Z if calm else Z_THRESHOLD):
+        if not top or abs(top[0].z) < Z_THRESHOLD:
+            break
+        unsure = calm and abs(top[0].z) < SECOND_Z
+        if unsure and not foretell:
             break
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
@@ -104,11 +112,13 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
         if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
             break
         if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)):
-            if check and not _predicts_worse(state.current, best.result, check, task.bench):
-                state.current, state.form = best.result, best.name
+            if check and not _predicts_worse(state.current, best.result, foretell):
+                state.current, state.form, made_up = best.result, best.name, best.candidate
             break
         further = state.steps and check and not _decides(state.current, best, excess)
-        if further and _predicts_worse(state.current, best.result, check, task.bench):
+        if further and _predicts_worse(state.current, best.result, foretell):
+            break
+        if unsure and best.drop + _confirmed(state.current, best.result, foretell) < SECOND_Z**2:
             break
         left = screened(best.result, task.choices)
         if not state.steps and not _promises(base, best.result, left):
@@ -122,7 +132,7 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
         if ends(state.current):
             return state
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
-        _backward(task, state)
+        _backward(task, state, made_up)
         _exchange(task, state, check)
         if _commuted(task, state, scored.get("sensor_lag")):
             _exchange(task, state, check)
@@ -210,15 +220,25 @@ def _decides(current, best, excess) -> bool:
     return current.chi2_per_sample > FAR_BESIDE and met and best.drop > DECISIVE * excess
 
 
-def _predicts_worse(before, after, check, bench) -> bool:
-    """Does a further effect raise the error on check recordings, taken together in units of their noise?"""
-    rows = check_errors(before.actuator, after.actuator, check, bench)
+def _predicts_worse(before, after, foretell) -> bool:
+    """Do the check recordings say against a further effect?"""
+    says = foretell.says_for(after, before)
+    if says is not None:
+        return says < 0
+    rows = check_errors(before.actuator, after.actuator, foretell.recordings, before.bench)
     old, new = (sum((r[k] / (r["noise_rms"] or r["rms_before"])) ** 2 for r in rows) for k in ("rms_before", "rms_after"))
     return new > 1.02 * old
 
 
-def _backward(task, state):
+def _confirmed(before, after, foretell) -> float:
+    """What the check recordings say for a further effect, as a fall of chi2; without end against it where that is next to nothing."""
+    says = foretell.says_for(after, before)
+    return says if says is not None and says > BIC_DROP else -np.inf
+
+
+def _backward(task, state, made_up=None):
     """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open.
+    `made_up`: the candidate of `state.form`, which takes the place of what it has made needless.
 
     The form error of a right effect looks like another effect until the rest is in place. So is the last one dropped where it
     has come out as nothing: what it seemed to take, the others took when they were fitted once more beside it.
@@ -228,15 +248,29 @@ def _backward(task, state):
         actuator = state.current.actuator
         if name not in {e.name for e in actuator.effects}:
             continue
-        if step is state.steps[-1] and (len(state.steps) == 1 or not _nothing(state.current, name)):
+        last = step is state.steps[-1] and not state.form
+        if last and (len(state.steps) == 1 or not _nothing(state.current, name)):
             continue
         task.say(f"without {name}", state.current.chi2_per_sample)
         most = max(chi2_of(state.current) + MIN_DROP, chi2_of(state.current) + excess_of(state.current, NULL_CHI2))
         trial = task.fit_on(state.current, actuator.without_effect(name), target=most)
         rise = chi2_of(trial) - chi2_of(state.current)
         if rise < max(MIN_DROP, HALF * excess_of(trial, NULL_CHI2)):
-            state.steps.remove(step)
             state.current = trial
+            if state.form:
+                state.steps[state.steps.index(step)] = _in_its_place(step, made_up, trial)
+                state.form = None
+            else:
+                state.steps.remove(step)
+
+
+def _in_its_place(step, candidate, result):
+    """The step of an effect that was dropped, with what made up for its form: then the form was not its own."""
+    _, _, good, previous = step
+    effect = result.actuator.effect(candidate.name)
+    found = credited(candidate, result, previous, effect, max(excess_of(previous), MIN_DROP))
+    trials = [found, *(t for t in good if t.name != candidate.name)]
+    return found, rivals_of(found, trials), trials, previous
 
 
 def _nothing(result, name) -> bool:

@@ -161,10 +161,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
     corners = int(4 * np.ceil(corners / 4))
-    # a narrow loop under a strong field turns within a few samples
-    finer = 2 if known_field else 1
-    grids = (finer * choices.coarse, finer * choices.fine)
-    predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in grids)
+    predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in period_samples(choices, bench))
     lines = np.stack([s.reading[: harmonics + 1] for s in spectra])
     deviations = np.stack(deviations)
     if actuator.output == "flux_density":  # an integrated emf has no mean
@@ -179,6 +176,12 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         template = template.remembering(bench.start)
     problem = Problem(layout, template, predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
+
+
+def period_samples(choices: Choices, bench) -> tuple[int, int]:
+    """Samples a period for the Jacobian and for the residual."""
+    finer = 2 if bench.drive == "field" else 1  # a narrow loop under a strong field turns within a few samples
+    return finer * choices.coarse, finer * choices.fine
 
 
 def field_of_rest(name: str, actuator, low: float, high: float) -> float:

@@ -32,8 +32,9 @@ PROMISES = 8.0  # times the Newton decrement, that going on with a fit may gain 
 DOMINANT_TEXT = " What is left is the form of its law, or something weaker beside it: no other effect takes nearly as much."
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 NO_BETTER = (3.0, 10.0, 0.8)  # chi2/N and check recordings' misfit from which what explains the one must lower the other to this share
-SURE_Z, SURE_WORSE = 12.0, 1.5  # score from which what meets the noise may foretell so much worse: where a density that no recording told of is in the way
-WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording
+WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording, that a repair may leave
+AS_EXPECTED = 3.0  # chi2 per number of check recordings in units of what the fit expects to miss: there it errs as it says it does
+SAYS_FOR = 10.0  # what these then say for a repair, as a fall of chi2, though their errors rise
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
@@ -194,6 +195,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     steps, current = evidence.reached.steps, evidence.reached.current
     raw, clean = evidence.checks
     rows = tuple(check_errors(evidence.raw.actuator, current.actuator, raw, evidence.bench, clean)) if raw else ()
+    rows = tuple(evidence.reached.foretell.beside(rows, current)) if evidence.reached.foretell else rows
     common = {
         "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
         "candidates": achieved(evidence), "repaired": current if steps or evidence.adopted else None,
@@ -206,8 +208,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         first = first_alone(evidence)
         return verdict(first) if first is not None else _unknown(evidence, common)
-    times = SURE_WORSE if sure(evidence) else WORSE[0]
-    if steps and after > times * before + WORSE[1] * len(rows):  # a repair that foretells worse is not physics
+    worse = after > WORSE[0] * before + WORSE[1] * len(rows)
+    if steps and worse and not as_expected(evidence):  # a repair that foretells worse is not physics
         return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     if steps and far_off and after > NO_BETTER[2] * before:
@@ -237,11 +239,14 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
 
 
-def sure(evidence) -> bool:
-    """Whether what was found meets the noise, and each of it scored as no density does: what check recordings ask of cells that
-    no recording switched moves by chance."""
-    scores = [abs(best.candidate.z) for best, *_ in evidence.reached.steps]
-    return not evidence.missing and min(scores, default=0.0) > SURE_Z
+def as_expected(evidence) -> bool:
+    """Whether what was found meets the noise and errs on the check recordings as it expects, for cells that no recording switched,
+    and these speak for it: the plain fit expected to err less, and was wrong."""
+    foretell = evidence.reached.foretell
+    if evidence.missing or not foretell or foretell(evidence.reached.current) is None:
+        return False
+    says = foretell.says_for(evidence.reached.current, evidence.plain)
+    return foretell(evidence.reached.current).whitened < AS_EXPECTED and says > SAYS_FOR
 
 
 def dominant(evidence) -> bool:

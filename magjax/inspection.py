@@ -7,7 +7,7 @@ import numpy as np
 from .clipping import quantum
 from .errors import RecordingError
 from .plausibility import STRONG_FIELD
-from .recording import NO_ANSWER, follows_nothing
+from .recording import NO_ANSWER, follows_nothing, stray_samples
 from .terms import DRIVE_UNITS
 
 LITTLE = 1e-4  # of the relays of the plane: a hundredth of its width
@@ -75,6 +75,7 @@ def inspect(recording, bench) -> Card:
             if np.ptp(v) / step < 40:
                 problems.append(f"{name} spans only {np.ptp(v) / step:.0f} counts; raise the gain of the converter")
     _judge_gaps(recording, facts, problems, warnings)
+    _judge_strays(recording, warnings)
     _judge_clock(recording, warnings)
     if f is None:
         facts["periods"] = "aperiodic: usable as a check recording, not in a fit"
@@ -137,6 +138,16 @@ def _judge_gaps(recording, facts, problems, warnings):
         problems.append(f"{facts['gaps']}: too much to be called measured; record again")
     else:
         warnings.append(f"{filled} missing samples were filled; look for the recorder's drops if they come often")
+
+
+def _judge_strays(recording, warnings):
+    number, channels = stray_samples(recording)
+    if number:
+        verb = "sample stands" if number == 1 else "samples stand"
+        warnings.append(
+            f"{number} {verb} far off alone ({channels}), as interference leaves them, and {'is' if number == 1 else 'are'} put where the other "
+            "periods are; look for switching loads if it comes often"
+        )
 
 
 def _applied(bench, x):

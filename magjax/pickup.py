@@ -1,4 +1,4 @@
-"""Periodic channels mended and integrated: gaps filled, repeated captures joined, a pick-up coil's emf into flux density.
+"""Periodic channels mended and integrated: stray samples dropped, gaps filled, repeated captures joined, a pick-up coil's emf into flux density.
 
 All three rest on one model of a periodic signal, a constant and its harmonics fitted by least squares to the samples that
 are there; so periods need not divide the sampling, and a gap needs no interpolation across it.
@@ -11,6 +11,9 @@ from .recording import fundamental
 
 MOST_HARMONICS = 40
 MOST_MISSING = 0.1  # of the samples
+STRAY = 15.0  # times the scatter of the samples about their harmonics: none of a million lies as far out by chance
+MOST_STRAY, WIDEST_STRAY = 2e-3, 3  # of the samples that may stray, and how many in a row
+MOST_ROUNDS = 12
 
 
 def _harmonics(phases, orders):
@@ -64,6 +67,75 @@ def bridge_gaps(time, channels, drive):
     known, lacking = _design(f * dt * index, orders), _design(f * dt * wanted, orders)
     filled = {q: _fill(full, index, wanted, v, lacking @ np.linalg.lstsq(known, v, rcond=None)[0]) for q, v in channels.items()}
     return dt * full, filled, missing
+
+
+def without_strays(time, channels, drive):
+    """A periodic run with single samples far off, as interference leaves, put where their harmonics are: (channels, {channel: how many}).
+
+    What lies beyond `STRAY` times the scatter about the harmonics of its channel (of the median, so that strays do not count in
+    it), a few samples at most, and at no such phase of another period: an edge that repeats is the signal's own. Only where the
+    drive repeats three times; else, and where more than a few stray, everything is returned as it is.
+    """
+    grid = _grid(time, channels) if any(_jumps(v) for v in channels.values()) else None
+    if grid is None:
+        return channels, {}
+    dt, index, _ = grid
+    full = np.arange(index[-1] + 1)
+    mended, counts = {**channels, drive: _by_neighbours(channels[drive])}, {}
+    for _ in range(2):  # a stray of the drive moves its period, and with it all others
+        f = fundamental(np.interp(full, index, mended[drive]), dt)
+        if f is None or len(full) * dt * f < 3 - 1e-6:
+            return channels, {}
+        phases = f * dt * index
+        design = _design(phases, _orders(phases, 1 / (f * dt)))
+        mended, counts = dict(channels), {}
+        for name, values in channels.items():
+            bad, smooth = _strays(values, design, phases) if _jumps(values) else (np.zeros(len(values), bool), values)
+            if bad.any():
+                mended[name], counts[name] = np.where(bad, smooth, values), int(bad.sum())
+    return mended, counts
+
+
+def _jumps(values) -> bool:
+    """Whether a sample lies off its neighbours far more than most do: a look before the harmonics are fitted."""
+    bend = np.abs(np.diff(values, 2))
+    return len(bend) > 0 and bool(bend.max() > STRAY * np.median(bend) / 0.6745)
+
+
+def _by_neighbours(values):
+    """The channel with samples far off the middle of their neighbours put there: good enough to find its period by."""
+    around = np.stack([np.roll(values, k) for k in (-2, -1, 1, 2)])
+    around[:, :2], around[:, -2:] = values[2:4].mean(), values[-4:-2].mean()
+    middle = np.median(around, axis=0)
+    off = np.abs(values - middle)
+    return np.where(off > STRAY * np.median(off) / 0.6745, middle, values)
+
+
+def _strays(values, design, phases):
+    """Which samples of a channel stray, none where these are too many to be strays, and its harmonics without them: (samples,) each."""
+    none, most = np.zeros(len(values), bool), max(MOST_STRAY * len(values), WIDEST_STRAY)
+    bad = none
+    for _ in range(MOST_ROUNDS):  # a stray moves the harmonics and hides smaller ones behind what it does to its neighbours
+        some = design[~bad]
+        smooth = design @ np.linalg.solve(some.T @ some, some.T @ values[~bad])
+        off = np.abs(values - smooth)
+        rest = np.where(bad, 0.0, off)
+        now = rest > max(STRAY * np.median(rest) / 0.6745, 0.5 * rest.max())
+        if not now.any() or bad.sum() > most:
+            break
+        bad = bad | now
+    if not bad.any() or bad.sum() > most or now.any():
+        return none, smooth
+    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], bad, [0]]))))[::2]
+    if not bad.any() or now.sum() > most or runs.max() > WIDEST_STRAY:
+        return none, smooth
+    at, step = phases % 1.0, phases[1] - phases[0]
+    for k in np.flatnonzero(bad):
+        away = np.abs(at - at[k])
+        same = (np.minimum(away, 1 - away) < 1.5 * step) & (np.abs(phases - phases[k]) > 0.5)
+        if same.any() and off[same].max() > 0.3 * off[k]:
+            return none, smooth
+    return bad, smooth
 
 
 def _fill(full, index, wanted, values, guesses):

@@ -10,7 +10,7 @@ from .clipping import refuse_clipping
 from .columns import USUAL, column_of, quantity_of
 from .errors import ConfigurationError, RecordingError
 from .formats import read_table
-from .pickup import bridge_gaps, integrate_emf, merge_captures
+from .pickup import bridge_gaps, integrate_emf, merge_captures, without_strays
 from .plausibility import check_sizes
 from .recording import BYSTANDERS, Recording, refuse_constant
 
@@ -209,6 +209,9 @@ def _one(name, columns, units, origin, bench) -> Recording:
         if not np.median(np.diff(time)) > 0:
             raise RecordingError(f"{name}: time does not increase from most samples to the next; rewrite the time column")
         widest = int(round(np.diff(time).max() / max(float(np.median(np.diff(time))), 1e-300))) - 1
+        channels, strays = without_strays(time, channels, bench.drive)
+        if strays:
+            metadata |= {"stray_samples": sum(strays.values()), "stray_channels": " and ".join(strays)}
         time, channels, bridged = bridge_gaps(time, channels, bench.drive)
         if bridged:
             metadata |= {"bridged_samples": bridged, "widest_gap_samples": widest}

@@ -157,6 +157,14 @@ class Recording:
 NO_ANSWER = "the {channel} does not follow the {drive}: its periods share no more than noise does; check the wiring and the column"
 
 
+def stray_samples(recording: Recording) -> tuple[int, str]:
+    """How many single samples stood far off and were put where the other periods are when it was read, and of which channels."""
+    metadata = recording.origin.get("metadata", {})
+    number = metadata.get("stray_samples", 0)
+    number = int(number) if isinstance(number, (int, float)) and 0 < number < 1e9 else 0
+    return number, str(metadata.get("stray_channels", "")) if number else ""
+
+
 def follows_nothing(recording: Recording, channel: str) -> bool:
     """Whether the periods of a channel share no more than independent noise would; False with less than two periods."""
     blocks = recording.repeats(channel)

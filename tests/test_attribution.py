@@ -350,19 +350,6 @@ def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, 
     assert module.verdict(evidence).verdict == word
 
 
-@pytest.mark.parametrize(("z", "left", "found"), [(18.8, 0.95, True), (8.0, 0.95, False), (18.8, 1.4, False)])
-def test_what_meets_the_noise_and_scores_high_is_sure(z, left, found):
-    """A friction of 0.2 % that scored 18.8 took all of a misfit, and foretold check recordings a little worse that were missed by five
-    times their noise before."""
-    from fitting.verdict import sure
-
-    best = trial("coulomb_friction", left, base=1.49)
-    best = dataclasses.replace(best, candidate=dataclasses.replace(best.candidate, z=z))
-    fits = SimpleNamespace(chi2_per_sample=left, data_count=COUNT), SimpleNamespace(chi2_per_sample=1.49, data_count=COUNT)
-    evidence = SimpleNamespace(reached=Reached(fits[0], [(best, [], [], fits[1])], {}), missing=left > 1.15)
-    assert sure(evidence) == found
-
-
 def searched(monkeypatch, ends, follows):
     """`search._of_two` with trials that end at chi2/N `ends`; `follows`: after each the best score, and where a fit of it ends."""
     trials = [trial(n, x, base=110.0, direction=d) for n, x, d in ends]
@@ -454,6 +441,37 @@ def test_the_last_effect_is_dropped_where_it_has_come_out_as_nothing(value, left
 
     fitting.search._backward(SimpleNamespace(say=lambda *a: None, fit_on=without), state)
     assert [step[0].name for step in state.steps] == ["rate_dependent_switching", "magnetic_aftereffect"][:kept]
+
+
+@pytest.mark.parametrize(("left", "named"), [(1.05, ["transport_delay", "magnetic_aftereffect"]), (9.0, ["transport_delay", "creep"])])
+def test_what_makes_up_for_a_form_and_makes_the_effect_needless_was_that_effect(left, named):
+    """A creep was adopted beside a delay and an after-effect made up for its form; without the creep the fit is as good, and the
+    after-effect had been dropped from the verdict with it."""
+    effects = tuple(CLASSES[name]() for name in ("transport_delay", "creep", "magnetic_aftereffect"))
+
+    def fitted(chi2n):
+        actuator = SimpleNamespace(
+            effects=effects, effect=lambda name: next(e for e in effects if e.name == name), without_effect=lambda name: name
+        )
+        return SimpleNamespace(
+            chi2_per_sample=chi2n, data_count=COUNT, actuator=actuator,
+            estimate=lambda name: SimpleNamespace(value=0.01, stderr=0.001),
+        )  # fmt: skip
+
+    plain, lagged = fitted(200.0), fitted(2.6)
+    first, second = trial("transport_delay", 2.6, base=200.0), trial("creep", 1.15, base=2.6)
+    state = Reached(fitted(1.04), [(first, [first], [first], plain), (second, [second], [second], lagged)], {}, form="magnetic_aftereffect")
+
+    def fit_on(current, fewer, target):
+        return fitted(left if fewer == "creep" else 150.0)
+
+    task = SimpleNamespace(say=lambda *a: None, fit_on=fit_on)
+    fitting.search._backward(task, state, candidate("magnetic_aftereffect", 20.0))
+    assert [step[0].name for step in state.steps] == named
+    assert state.form == (None if left < 2 else "magnetic_aftereffect")
+    if left < 2:
+        best, rivals, _, previous = state.steps[1]
+        assert previous is lagged and best.drop == pytest.approx((2.6 - left) * COUNT) and rivals[0] is best
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magjax.errors import RecordingError
-from magjax.pickup import integrate_emf, merge_captures
+from magjax.pickup import integrate_emf, merge_captures, without_strays
 
 TURNS, AREA, F = 75, 2e-6, 50.0
 COIL = {"emf_turns": TURNS, "emf_area": AREA}
@@ -131,3 +131,67 @@ def test_a_capture_that_cannot_be_joined_is_named(spoil, word):
     spoil(captures[1])
     with pytest.raises(RecordingError, match=f"rod.csv.*capture 1.*{word}"):
         merge_captures(captures, BENCH, "rod.csv")
+
+
+def run_of(per=200.0, periods=4, seed=0):
+    """Drive and reading with an edge that repeats, a little noise."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(int(per * periods)) / (per * F)
+    reading = flux(time) + 0.2 * np.tanh(40 * np.sin(2 * np.pi * F * time)) + 1e-3 * rng.standard_normal(len(time))
+    return time, {"current": drive(time) / 800 + 1e-4 * rng.standard_normal(len(time)), "displacement": reading}
+
+
+@pytest.mark.parametrize("per", [200.0, 173.3])
+def test_single_samples_far_off_are_put_where_their_harmonics_are(per):
+    time, clean = run_of(per)
+    struck = {q: v.copy() for q, v in clean.items()}
+    for at, by in ((101, 0.9), (102, 0.7), (555, -0.4)):
+        struck["displacement"][at] += by
+    struck["current"][0] -= 3.0
+    mended, counts = without_strays(time, struck, "current")
+    assert counts == {"current": 1, "displacement": 3}
+    assert np.abs(mended["displacement"] - clean["displacement"]).max() < 0.05
+    assert np.abs(mended["current"] - clean["current"]).max() < 1e-3
+    there = np.ones(len(time), bool)
+    there[[101, 102, 555]] = False
+    assert np.array_equal(mended["displacement"][there], clean["displacement"][there])  # all others are as they were
+    assert without_strays(time, mended, "current") == (mended, {})
+
+
+@pytest.mark.parametrize("what", ["nothing", "repeats", "many", "wide", "two periods", "too small"])
+def test_what_else_stands_out_stays(what):
+    time, channels = run_of(periods=2 if what == "two periods" else 4)
+    places = {
+        "nothing": [], "repeats": [60, 260, 460, 660], "many": range(40, 700, 60), "wide": range(300, 305), "two periods": [50],
+        "too small": [50],
+    }[what]  # fmt: skip
+    for at in places:
+        channels["displacement"][at] += 0.005 if what == "too small" else 0.8
+    mended, counts = without_strays(time, channels, "current")
+    assert mended is channels or all(mended[q] is channels[q] for q in channels)
+    assert counts == {}
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_file_with_strays_is_mended_where_it_is_read_and_says_so(tmp_path, number):
+    from fitting.fit import strayed
+    from magjax.bench import load_bench
+    from magjax.inspection import inspect
+    from magjax.readers import load_recordings
+
+    time, channels = run_of(200.0)
+    current, reading = channels["current"], 2e-5 + 1e-5 * channels["displacement"]
+    for at in (333, 444)[:number]:
+        reading[at] += 3e-5
+    path = tmp_path / "run.csv"
+    rows = "\n".join(f"{t:.9g},{i:.9g},{y:.9g}" for t, i, y in zip(time, 0.5 * current, reading, strict=True))
+    path.write_text(f"time_s,current_A,displacement_m\n{rows}\n")
+    bench = load_bench("aa-050h")
+    (recording,) = load_recordings([path], bench)
+    assert np.ptp(recording.channels["displacement"]) < 3.5e-5
+    card = inspect(recording, bench)
+    said = [w for w in card.warnings if "far off alone" in w]
+    assert len(said) == (number > 0) and not card.problems
+    if number:
+        assert said[0].startswith(f"{number} sample") and "displacement" in said[0]
+    assert strayed([recording]) == (f"; samples that stood far off alone were left out: run.csv ({number})" if number else "")

@@ -17,6 +17,7 @@ TONES = {
 }
 FILE = re.compile(r"(?:^|[.] )((?:(?![.] )[^:])+?[.][A-Za-z]\w*): ")  # that an error begins with
 FORETOLD = 1.4  # times its noise, up to which a check recording is foretold
+AS_EXPECTED = 1.5  # times what the model expects its error to be
 
 
 def spoken(text: str, names) -> str:
@@ -44,9 +45,10 @@ def still_left(found) -> str:
     if missed:
         r = max(missed, key=lambda r: r["rms_after"] / r["noise_rms"])
         fine, unit = scale_of(tables.CHANNEL_OF.get(r["unit"], "displacement"))[2:]
-        said.append(
-            f"a check recording is missed by {plain(fine * r['rms_after'])} {unit} (noise {plain(fine * r['noise_rms'])} {unit})"
-        )
+        noise = f"noise {plain(fine * r['noise_rms'])} {unit}"
+        if r["rms_after"] < AS_EXPECTED * (r.get("expected_rms") or 0.0):
+            noise += f"; about as expected, {plain(fine * r['expected_rms'])} {unit}: the recordings tell little of the cells that it switches"
+        said.append(f"a check recording is missed by {plain(fine * r['rms_after'])} {unit} ({noise})")
     return " and ".join(said)
 
 

@@ -204,15 +204,20 @@ def before_and_after(base, repaired, found) -> dict | None:
 def checks(rows, repaired: bool = True) -> dict:
     """Prediction errors on recordings that took no part."""
     keys, units, numbers = ("rms_before", "rms_after") if repaired else ("rms_after",), [], []
+    told = any(r.get("expected_rms") for r in rows)
     for r in rows:
         fine, unit = scale_of(CHANNEL_OF.get(r["unit"], "displacement"))[2:]
         beyond = [(max(r[k] ** 2 - r["noise_rms"] ** 2, 0.0)) ** 0.5 for k in keys]
-        numbers.append([fine * v for v in (*(r[k] for k in keys), r["noise_rms"], *beyond)])
+        more = [r.get("expected_rms") or float("nan")] if told else []
+        numbers.append([fine * v for v in (*(r[k] for k in keys), *more, r["noise_rms"], *beyond)])
         units.append(unit)
     body = [[Path(r["file"]).name, *texts, unit] for r, texts, unit in zip(rows, aligned(numbers), units, strict=True)]
     when = (" before", " after") if repaired else ("",)
-    head = ["recording", *(f"rms error{w}" for w in when), "noise rms", *(f"beyond noise{w}" for w in when), "unit"]
-    note = f"Beyond noise: √(rms error² − noise rms²), 0 where the error is the smaller. {beyond_text(rows)}".strip()
+    expected = ["expected"] if told else []
+    head = ["recording", *(f"rms error{w}" for w in when), *expected, "noise rms", *(f"beyond noise{w}" for w in when), "unit"]
+    note = "Beyond noise: √(rms error² − noise rms²), 0 where the error is the smaller. "
+    note += "Expected: the noise and what the last model does not know of its parameters and of the cells that the drive switches. " if told else ""
+    note = f"{note}{beyond_text(rows)}".strip()
     return table("Errors of prediction", head, body, note, code=True)
 
 

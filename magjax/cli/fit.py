@@ -100,6 +100,7 @@ def run_fit(arguments) -> int:
     refuse_absent_and_twice(options.recordings, options.check)
     from fitting.check import check_errors
     from fitting.fit import fit
+    from fitting.foretold import Foreteller
     from fitting.reach import beyond_text
     from fitting.setup import Choices, effect_parameters, free_parameters
 
@@ -123,7 +124,8 @@ def run_fit(arguments) -> int:
         except (MagjaxError, KeyboardInterrupt) as error:  # the fit itself is done and is kept
             stopped = error
         content = result.as_dict() | more
-        content["check"] = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
+        rows = check_errors(result.actuator, result.actuator, checks, bench) if checks else []
+        content["check"] = Foreteller(checks, result).beside(rows, result)
         content["check_left_out"] = list(refused)
         table = None
         if options.recipe:
@@ -145,7 +147,8 @@ def run_fit(arguments) -> int:
         if text:
             print(f"\n{text}")
         for row in content["check"]:
-            print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g})")
+            expected = f", expected {row['expected_rms']:.3g}" if row["expected_rms"] else ""
+            print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g}{expected})")
         if note := beyond_text(content["check"]):
             print(f"  {note}")
         for why in refused:
