@@ -13,6 +13,7 @@ from magjax.bench import load_bench
 from .alternation import alternating
 from .attribute import (
     BIC_DROP,
+    CLOSE,
     LIKE_DENSITY,
     MIN_DROP,
     MISFIT,
@@ -309,7 +310,7 @@ def _own_zeros(task, adopted, base, candidates):
         return None
     excess = excess_of(base)
     z, zeros, errors = zeros_score(base.problem, base.refined)
-    likely = [c for c in candidates if c.z**2 > z**2 - max(TIE, WEAK_TIE[0] * z**2)]
+    likely = [c for c in candidates if abs(c.z) > CLOSE * z]
     if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 * (1 - WEAK_TIE[0]) - TIE for c in candidates)]):
         return None
     effect, *rivals = zeros_of(base.spectra, z, zeros, errors, [e.name for e, _ in adopted])
@@ -320,6 +321,10 @@ def _own_zeros(task, adopted, base, candidates):
     if not met or chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
         return None
     cost = chi2_of(freed) + len(zeros) * np.log(freed.data_count)
+    if freed.choices != base.choices:  # on the same density: a rough one would speak against them
+        task = task.on(choices=freed.choices)
+        base = task.fit_on(freed, base.actuator, spectra=base.spectra)
+        excess = excess_of(base)
     trials = (settled(task, base, try_effect(task, base, c, excess), excess) for c in likely[:MOST_LIKELY])
     if any(t.physical and chi2_of(t.result) + t.parameters * np.log(freed.data_count) < cost for t in trials):
         return None

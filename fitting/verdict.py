@@ -33,7 +33,8 @@ DOMINANT_TEXT = " What is left is the form of its law, or something weaker besid
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 NO_BETTER = (3.0, 10.0, 0.8)  # chi2/N and check recordings' misfit from which what explains the one must lower the other to this share
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording, that a repair may leave
-AS_EXPECTED = 3.0  # chi2 per number of check recordings in units of what the fit expects to miss: there it errs as it says it does
+AS_EXPECTED = 3.0  # chi2 per number of check recordings in units of what the fit expects to miss: there it errs as it says it does;
+NEARER = (6.0, 0.3)  # or within this, and this share of the plain fit's
 SAYS_FOR = 10.0  # what these then say for a repair, as a fall of chi2, though their errors rise
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
@@ -245,8 +246,9 @@ def as_expected(evidence) -> bool:
     foretell = evidence.reached.foretell
     if evidence.missing or not foretell or foretell(evidence.reached.current) is None:
         return False
-    says = foretell.says_for(evidence.reached.current, evidence.plain)
-    return foretell(evidence.reached.current).whitened < AS_EXPECTED and says > SAYS_FOR
+    now, before = (foretell(fit).whitened for fit in (evidence.reached.current, evidence.plain))
+    near = now < AS_EXPECTED or now < min(NEARER[0], NEARER[1] * before)
+    return near and foretell.says_for(evidence.reached.current, evidence.plain) > SAYS_FOR
 
 
 def dominant(evidence) -> bool:

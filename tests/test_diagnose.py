@@ -319,6 +319,30 @@ def test_means_go_with_a_drift_where_they_hold_nearly_all(monkeypatch, bench, dr
     assert (found is not None) == free and (not free or found[1] == (own, []) and found[2] is ended)
 
 
+@pytest.mark.parametrize(("coarse", "fine", "free"), [(2.5, 1.02, False), (2.5, 1.9, True)], ids=["an effect serves", "none does"])
+def test_effects_are_held_against_means_on_the_density_that_these_got(monkeypatch, bench, coarse, fine, free):
+    """A strain_hysteresis left chi2/N 2.5 on the first hats; means of their own, with finer ones, 1.17. On these it leaves 1.15."""
+    monkeypatch.setattr(module, "zeros_score", lambda *a: (90.0, np.zeros(9), np.ones(9)))
+    own = RecordEffect("zero_drift", 90.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
+    monkeypatch.setattr(module, "zeros_of", lambda *a: [own])
+    base, freed, beside = a_fit(9.4, 55.0), a_fit(1.0, 60.0), a_fit(5.7, 56.0)
+    for found, choices in ((base, Choices()), (freed, Choices(knots=(26, 18), level=104)), (beside, Choices(knots=(26, 18), level=104))):
+        found.choices, found.problem, found.refined, found.spectra, found.data_count = choices, None, None, None, 1000
+    monkeypatch.setattr(Task, "fit", lambda task, actuator: freed)
+    monkeypatch.setattr(Task, "fit_on", lambda task, start, actuator, spectra: beside if start is freed else None)
+    monkeypatch.setattr(module, "settled", lambda task, base, trial, excess: trial)
+
+    def tried(task, start, candidate, excess):
+        assert task.choices == freed.choices and start is beside
+        ended = a_fit(fine if start is beside else coarse, 60.0)
+        ended.data_count = 1000
+        return trial(candidate.name, ended, 4000.0)
+
+    monkeypatch.setattr(module, "try_effect", tried)
+    found = module._own_zeros(Task((), bench), [], base, [scored("creep", 80.0), scored("strain_hysteresis", 75.0), scored("backlash", 60.0)])
+    assert (found is not None) == free
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("number", [29, 42], ids=["a hum that is too weak", "null"])
 def test_silent_on_random_cells(tmp_path, number):

@@ -108,19 +108,22 @@ def test_what_does_not_serve_is_left_out(bench, null, plain):
 
 
 @pytest.mark.parametrize(
-    ("missing", "white", "says", "found"),
-    [(False, 1.2, 40.0, True), (True, 1.2, 40.0, False), (False, 4.0, 40.0, False), (False, 1.2, 5.0, False), (False, None, 0.0, False)],
-)
-def test_a_repair_that_errs_as_it_expects_may_be_named(missing, white, says, found):
+    ("missing", "white", "before", "says", "found"),
+    [
+        (False, 1.2, 2.0, 40.0, True), (True, 1.2, 2.0, 40.0, False), (False, 5.0, 8.0, 40.0, False), (False, 5.0, 28.0, 40.0, True),
+        (False, 9.0, 90.0, 40.0, False), (False, 1.2, 2.0, 5.0, False), (False, None, None, 0.0, False),
+    ],
+)  # fmt: skip
+def test_a_repair_that_errs_as_it_expects_may_be_named(missing, white, before, says, found):
     """A friction of 0.2 % took all of a misfit; check recordings, missed by five times their noise for cells that none had switched,
     got a little worse with it by chance."""
     from fitting.verdict import as_expected
 
     class Told:
         def __call__(self, fitted):
-            return None if white is None else SimpleNamespace(whitened=white)
+            return None if white is None else SimpleNamespace(whitened=white if fitted == "now" else before)
 
-        def says_for(self, after, before):
+        def says_for(self, after, plain):
             return says
 
     evidence = SimpleNamespace(missing=missing, plain="plain", reached=SimpleNamespace(foretell=Told(), current="now"))
