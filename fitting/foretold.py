@@ -128,6 +128,8 @@ def _deviations(problem, spectrum):
     found = np.full(problem.predictors[0].harmonics + 1, np.inf)
     own = line_deviations(spectrum, spectrum.noise)[: len(found)]
     found[: len(own)] = own
+    if np.isinf(np.asarray(problem.target.deviations)[:, 0]).all():  # an integrated emf has no mean
+        found[0] = np.inf
     return found
 
 

@@ -69,5 +69,5 @@ def searched(inputs, number, rng) -> dict:
 def _reading(spectrum, lines):
     """The spectrum with other reading lines; those beyond the fit's stay."""
     reading = spectrum.reading.copy()
-    reading[: len(lines)] = lines
+    reading[: len(lines)] = lines[: len(reading)]
     return dataclasses.replace(spectrum, reading=reading)

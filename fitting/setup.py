@@ -133,9 +133,9 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         level = 2 * choices.level if known_field else choices.level
         basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive != "current")
     rest = field_of_rest(choices.rest, actuator, basis.low, basis.high)
-    harmonics = min(choices.harmonics, min(len(s.reading) for s in spectra) - 1)
-    deviations = [line_deviations(s, s.noise)[: harmonics + 1] for s in spectra]
+    harmonics = min(choices.harmonics, max(len(s.reading) for s in spectra) - 1)
     full = [line_deviations(s, s.noise) for s in spectra]
+    deviations = [_padded(d, harmonics, np.inf) for d in full]
     memories = len(spectra) if actuator.output == "displacement" else 0
     starter = actuator  # its coil holds all of the eddy loss, for the equation error
     for loss in {"coil.k_eddy", EDDY_EFFECT} & set(names) if bench.drive == "field" and start is None and not held else ():
@@ -162,7 +162,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
     corners = int(4 * np.ceil(corners / 4))
     predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in period_samples(choices, bench))
-    lines = np.stack([s.reading[: harmonics + 1] for s in spectra])
+    lines = np.stack([_padded(s.reading, harmonics, 0.0) for s in spectra])
     deviations = np.stack(deviations)
     if actuator.output == "flux_density":  # an integrated emf has no mean
         deviations[:, 0] = np.inf
@@ -176,6 +176,11 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         template = template.remembering(bench.start)
     problem = Problem(layout, template, predictors, target, tuple(spectra), _quasistatic(bench))
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
+
+
+def _padded(values, harmonics: int, missing: float):
+    """Values of lines 0..harmonics; `missing` where a recording of few samples a period has none."""
+    return np.append(values[: harmonics + 1], np.full(max(harmonics + 1 - len(values), 0), missing))
 
 
 def period_samples(choices: Choices, bench) -> tuple[int, int]:

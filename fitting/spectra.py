@@ -265,7 +265,9 @@ def gain_rows(spectra, deviations):
     """
     rows, sizes = [], []
     for s, deviation in zip(spectra, deviations, strict=True):
-        row = s.reading[: len(deviation)] / deviation
+        row = np.zeros(len(deviation), complex)
+        row[: len(s.reading)] = s.reading[: len(deviation)]
+        row = row / deviation
         row[0] = row[0].real
         sizes.append(np.sqrt(np.sum(np.abs(row) ** 2)))
         rows.append(row / max(sizes[-1], 1e-300))

@@ -5,14 +5,12 @@ What is run together, and in which order it is told, does not depend on the mach
 
 import concurrent.futures
 import contextlib
-import ctypes
 import gc
-import sys
 import threading
 
 import jax
 
-from magjax.programs import forget
+from magjax.programs import forget, trim
 
 SIDE_BY_SIDE = 2
 
@@ -93,7 +91,4 @@ def let_go() -> None:
     forget()
     jax.clear_caches()
     gc.collect()
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc keeps what threads have freed
-        if trim is not None:
-            trim(0)
+    trim()

@@ -249,10 +249,14 @@ def _columns(content, path) -> dict:
     return columns
 
 
+LEAST_LIMIT = 1e-6  # A, A/m or V: no source is as small
+
+
 def _limits(content, path, drive) -> dict:
     limits = content.get("limits", {})
     for key, value in limits.items():
-        _positive(value, f"limits.{key}", path)
+        if _positive(value, f"limits.{key}", path) < LEAST_LIMIT:
+            raise ConfigurationError(f"bench {path}: limits.{key} = {value:g} drives nothing; give the largest that the source puts out, in the unit of the key")
     for other, key in LIMITS.items():
         if key in limits and other != drive and LIMITS[drive] not in limits:
             raise ConfigurationError(f"bench {path}: limits.{key} bounds a bench driven by a {other}; give limits.{LIMITS[drive]}")
@@ -293,6 +297,11 @@ def _fit(content, path, present, drive):
         )
     if output == "polarization" and drive != "voltage":
         raise ConfigurationError(f'bench {path}: fit.output = "polarization" needs [piezo]; write "magnetization" for a rod')
+    driven = [block for block in ("coil", "piezo") if block in content]
+    if output == "strain" and driven:
+        raise ConfigurationError(
+            f'bench {path}: fit.output = "strain" reads a table of strain curves, which nothing drives; take [{driven[0]}] away, or write "displacement"'
+        )
     if output == "displacement" and not moves:
         raise ConfigurationError(
             f'bench {path}: fit.output = "displacement" needs [magnetostriction]; add it or write "flux_density"'

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .bench import Bench
+from .bench import OUTPUTS, Bench
 from .errors import ConfigurationError
 from .preisach import Preisach
+from .terms import LIMITS
 
 
 def load_model(folder):
@@ -36,6 +37,9 @@ def _model(content):
     if isinstance(stated["start"], list):
         stated["start"] = tuple(stated["start"])
     bench = Bench(**stated)
+    for key, value, known in (("output", bench.output, OUTPUTS), ("drive", bench.drive, tuple(LIMITS))):
+        if value not in known:
+            raise ConfigurationError(f"bench.{key} = {value!r} is unknown; known are {', '.join(known)}")
     actuator = bench.actuator()
     plane = content["hysteresis"]
     hysteresis = Preisach(np.asarray(plane["masses"]), plane["low"], plane["high"], plane["offset"], rest=plane.get("rest"))

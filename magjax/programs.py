@@ -7,6 +7,7 @@ that holds a class from elsewhere (an effect in a notebook, which may change und
 """
 
 import contextlib
+import ctypes
 import dataclasses
 import functools
 import hashlib
@@ -14,6 +15,7 @@ import importlib
 import importlib.util
 import json
 import os
+import sys
 import threading
 import zlib
 from pathlib import Path
@@ -26,6 +28,7 @@ import numpy as np
 MOST = 300_000_000  # bytes on disk; beyond, those that were used longest ago go
 OWN = ("magjax", "fitting")
 IN_MEMORY: list[dict] = []  # the programs of every function
+COMPILING = threading.RLock()  # one at a time: to compile takes some hundred megabytes, up to a thousand
 
 
 def kept(function):
@@ -48,7 +51,9 @@ def kept(function):
                 program = known.get(key)
                 if program is None:
                     program = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
-                    found = program(leaves) if program else plain(*arguments)
+                    with COMPILING:
+                        found = program(leaves) if program else plain(*arguments)
+                        trim()
                     known[key] = program
                     return found
         return program(leaves) if program else plain(*arguments)
@@ -60,6 +65,14 @@ def forget() -> None:
     """Drop all programs from memory; they are read again where they are asked for."""
     for known in IN_MEMORY:
         known.clear()
+
+
+def trim() -> None:
+    """Give memory that was freed back to the system: glibc keeps what threads have freed."""
+    if sys.platform == "linux":
+        trimmed = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trimmed is not None:
+            trimmed(0)
 
 
 def _program(function, arguments, constants, key, leaves, folder):

@@ -41,6 +41,8 @@ def written(folder, text):
         ('[limits]\ncurrent_A = "x"', "limits.current_A = 'x' must be a finite number"),
         ("[limits]\ncurrent_A = -0.9", "limits.current_A = -0.9; give a positive"),
         ("[limits]\nfield_A_per_m = 300", "give limits.current_A"),
+        ("[limits]\ncurrent_A = 1e-12", "limits.current_A = 1e-12 drives nothing; give the largest"),
+        (COIL + ROD + '[fit]\noutput = "strain"', r"which nothing drives; take \[coil\] away"),
         ('[fit]\noutput = "velocity"', "fit.output = 'velocity' is unknown"),
         ('[fit]\noutput = "displacement"', r"needs \[magnetostriction\]"),
         ('[fit]\nfree = "coil.R_eddy"', r'write free = \["coil.R_eddy"\]'),
@@ -118,6 +120,8 @@ def test_a_model_that_does_not_hold_is_told_with_its_file(tmp_path):
     for change, words in (
         ({"hysteresis": {**whole["hysteresis"], "masses": masses}}, r"masses\[0, 0\] is negative.*mend it there, or fit again"),
         ({"hysteresis": {}}, "no 'masses'"),
+        ({"bench": {**whole["bench"], "output": "velocity"}}, "bench.output = 'velocity' is unknown; known are displacement"),
+        ({"bench": {**whole["bench"], "drive": "torque"}}, "bench.drive = 'torque' is unknown; known are current"),
         ({"bench": 3}, "not a fitted model"),
         ({"effects": ["nothing"]}, "no 'nothing'"),
     ):

@@ -17,8 +17,9 @@ from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import DensityBasis, cell_basis, hat_basis
 from fitting.fit import beyond_the_rod, cells_beside, finer_hats, finer_than, fit, guessed, loose, valleys
+from fitting.joint import data_residual
 from fitting.recipe import recipe_beside
-from fitting.setup import Choices
+from fitting.setup import Choices, build_problem, free_parameters, spectra_of
 from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import agreeing, operator_rows, unfold
@@ -60,6 +61,22 @@ def test_reaches_the_noise_and_the_constants(result):
         assert abs(estimate.value / true - 1) < 0.01
     assert "noise" in result.message
     assert "coil.R_eddy" in str(result)
+
+
+def test_a_recording_of_few_samples_a_period_leaves_the_others_their_harmonics(recordings, bench):
+    """Ten samples a period bear four harmonics; those of the others were cut to four as well."""
+    per = round(recordings[3].period_samples())
+    rows = slice(None, None, per // 10)
+    few = dataclasses.replace(
+        recordings[3], time=recordings[3].time[rows], channels={q: v[rows] for q, v in recordings[3].channels.items()}
+    )
+    spectra = spectra_of([*recordings[:3], few], bench)
+    problem, z = build_problem(spectra, bench.actuator(), bench, free_parameters(bench, bench.actuator()), Choices(rest="negative"))
+    bare = len(spectra[3].reading)
+    assert bare == 5 and problem.data_count == 3 * 81 + 2 * bare - 1
+    residual = data_residual(problem, z).reshape(-1)
+    real = residual[: 4 * 41].reshape(4, 41)
+    assert np.all(np.isfinite(residual)) and not real[3, bare:].any() and real[0, bare:].any()
 
 
 @pytest.mark.parametrize(("stroke", "frequency", "told"), [(6e-5, 10.0, False), (9e-5, 10.0, True), (9e-5, 300.0, False)])

@@ -1,5 +1,6 @@
 """Programs kept between processes: read where nothing has changed, traced where anything has."""
 
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -119,3 +120,35 @@ def test_nothing_is_kept_without_a_folder_or_without_room(folder, monkeypatch):
     assert np.allclose(scaled(line, values, 6.0)[0][0], 3.0 * np.arange(6))
     jax.config.update("jax_compilation_cache_dir", None)
     assert np.allclose(scaled(line, values, 7.0)[0][0], 3.5 * np.arange(6)) and TRACED == [5.0, 6.0, 7.0]
+
+
+def test_one_program_is_compiled_at_a_time(monkeypatch, folder):
+    """Two heavy ones side by side took 2.4 GB, one after the other 1.2."""
+    busy, most = [], []
+
+    def slow(function, *rest):
+        def run(leaves):
+            busy.append(function)
+            most.append(len(busy))
+            time.sleep(0.1)
+            busy.pop()
+            return leaves
+
+        return run
+
+    monkeypatch.setattr(programs, "_program", slow)
+    functions = [kept(lambda x, k=k: x) for k in range(3)]
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda f: f(np.ones(2)), functions))
+    assert most == [1, 1, 1]
+
+
+def test_a_kept_program_may_ask_for_another_while_it_is_traced(folder):
+    inner = kept(lambda x: x + 1.0)
+
+    @kept
+    def outer(x):
+        return x * jax.lax.stop_gradient(inner(np.ones(3)))
+
+    with ThreadPoolExecutor(1) as pool:
+        assert np.allclose(pool.submit(outer, np.arange(3.0)).result(timeout=60), [0.0, 2.0, 4.0])
