@@ -87,8 +87,7 @@ class Foreteller:
 def foretold(result, spectra) -> Foretold:
     """What a fit says of periodic recordings that took no part in it. `spectra`: theirs, of the same channels.
 
-    The floor of the density is let go, as an unknown that stands at it is not known to be there. What is not linear in the
-    unknowns is left out.
+    What is not linear in the unknowns is left out.
     """
     problem, z = result.problem, result.solution.z
     layout, count = problem.layout, len(problem.spectra)
@@ -101,7 +100,7 @@ def foretold(result, spectra) -> Foretold:
         slopes.append(own)
     residual, slope = np.concatenate(residuals), np.concatenate(slopes)
     shared = len(z) - memories
-    known = covariance(result.solution.normal, z, layout, range(layout.density_unknowns))[:shared, :shared]
+    known = _known(result.solution, layout)[:shared, :shared]
     spread = slope[:, :shared] @ known @ slope[:, :shared].T
     lines = len(residual) // len(spectra)
     for k in range(len(spectra) if memories else 0):  # the level of M of each is its own
@@ -121,6 +120,15 @@ def foretold(result, spectra) -> Foretold:
         unknown = float(weights @ np.diag(spread)[k * lines : (k + 1) * lines])
         expected.append(float(np.sqrt(unknown + s.noise_rms**2)))
     return Foretold(float(log_density), float(white @ white / max(real.sum(), 1)), tuple(expected))
+
+
+def _known(solution, layout):
+    """Covariance of the unknowns. One that stands at the floor of the density is not known to be there: the likelihood falls from
+    there as an exponential of its gradient, whose variance is 1 / gradient^2, or as a normal law where that is narrower."""
+    normal, n = np.array(solution.normal), layout.density_unknowns
+    floored = np.flatnonzero(~layout.inside(solution.z)[:n])
+    normal[floored, floored] += solution.gradient[floored] ** 2
+    return covariance(normal, solution.z, layout, range(n))
 
 
 def _deviations(problem, spectrum):

@@ -28,7 +28,8 @@ import numpy as np
 MOST = 300_000_000  # bytes on disk; beyond, those that were used longest ago go
 OWN = ("magjax", "fitting")
 IN_MEMORY: list[dict] = []  # the programs of every function
-COMPILING = threading.RLock()  # one at a time: to compile takes some hundred megabytes, up to a thousand
+COMPILING = threading.RLock()  # one heavy program at a time: to compile it takes up to a gigabyte
+HEAVY = 77_000  # bytes of what is compiled, more than the plain chain's programs have
 
 
 def kept(function):
@@ -51,9 +52,9 @@ def kept(function):
                 program = known.get(key)
                 if program is None:
                     program = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
-                    with COMPILING:
+                    with COMPILING if getattr(program, "heavy", False) else contextlib.nullcontext():
                         found = program(leaves) if program else plain(*arguments)
-                        trim()
+                    trim()
                     known[key] = program
                     return found
         return program(leaves) if program else plain(*arguments)
@@ -95,7 +96,12 @@ def _program(function, arguments, constants, key, leaves, folder):
     # on one device whatever the arguments come from: else each mixture of new arrays and results is compiled anew
     device = jax.config.jax_default_device or jax.local_devices()[0]
     run = jax.jit(exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device))
-    return lambda leaves: _filled(form, jax.tree.leaves(run(*leaves)))
+
+    def program(leaves):
+        return _filled(form, jax.tree.leaves(run(*leaves)))
+
+    program.heavy = len(exported.mlir_module_serialized) > HEAVY
+    return program
 
 
 def _traced(function, constants, tree, leaves):

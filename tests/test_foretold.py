@@ -10,10 +10,9 @@ import pytest
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.fit import fit
-from fitting.foretold import Foreteller, foretold
+from fitting.foretold import Foreteller, _known, foretold
 from fitting.model import Predictor
 from fitting.setup import Choices, period_samples, spectra_of
-from fitting.uncertainty import covariance
 from magjax.bench import load_bench
 from magjax.effects import QuarticMagnetostriction
 
@@ -59,7 +58,7 @@ def test_what_is_expected_is_the_spread_of_predictions(bench, null, plain):
     corners = problem.predictors[1].corners
     predictor = Predictor.build(spectra, period_samples(QUICK, bench)[1], problem.predictors[1].harmonics, QUICK.periods, corners)
     layout = problem.layout
-    known = covariance(plain.solution.normal, z, layout, range(layout.density_unknowns))
+    known = _known(plain.solution, layout)
     root = np.linalg.cholesky(known + 1e-14 * np.eye(len(z)) * np.trace(known) / len(z))
 
     def lines(y):

@@ -1,6 +1,6 @@
 """Programs kept between processes: read where nothing has changed, traced where anything has."""
 
-import time
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -122,25 +122,28 @@ def test_nothing_is_kept_without_a_folder_or_without_room(folder, monkeypatch):
     assert np.allclose(scaled(line, values, 7.0)[0][0], 3.5 * np.arange(6)) and TRACED == [5.0, 6.0, 7.0]
 
 
-def test_one_program_is_compiled_at_a_time(monkeypatch, folder):
-    """Two heavy ones side by side took 2.4 GB, one after the other 1.2."""
-    busy, most = [], []
+@pytest.mark.parametrize(("heavy", "at_once"), [(True, 1), (False, 3)])
+def test_heavy_programs_are_compiled_one_at_a_time(monkeypatch, folder, heavy, at_once):
+    """Two side by side took 2.4 GB, one after the other 1.2."""
+    busy, most, together = [], [], threading.Barrier(at_once)
 
     def slow(function, *rest):
         def run(leaves):
             busy.append(function)
+            together.wait(timeout=30)  # as many as may are in here
             most.append(len(busy))
-            time.sleep(0.1)
+            together.wait(timeout=30)
             busy.pop()
             return leaves
 
+        run.heavy = heavy
         return run
 
     monkeypatch.setattr(programs, "_program", slow)
     functions = [kept(lambda x, k=k: x) for k in range(3)]
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(lambda f: f(np.ones(2)), functions))
-    assert most == [1, 1, 1]
+    assert most == [at_once] * 3
 
 
 def test_a_kept_program_may_ask_for_another_while_it_is_traced(folder):
