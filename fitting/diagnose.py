@@ -45,6 +45,7 @@ from .verdict import (
     Z_THRESHOLD,
     Diagnosis,
     Evidence,
+    first_alone,
     least_excess,
     misfit,
     unexplained,
@@ -61,7 +62,7 @@ ABSORBED_VISIBILITY = 0.004
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.5  # of a misfit, that a finer density may leave where the first one was too coarse
-LEAVES_MISFIT = 2.0  # chi2/N beside an effect that was named, from which a learned function is tried in its place
+LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
@@ -235,11 +236,13 @@ def _concluded(task, evidence) -> Diagnosis:
 def _wrong_name(task, evidence, found):
     """A learned term that serves far better than the effect that was named, in another block, and foretells the check recordings
     no worse, where that effect leaves a misfit; None elsewhere."""
-    steps = evidence.reached.steps
-    if found.verdict not in ("attributed", "group") or len(steps) != 1 or not found.repaired.chi2_per_sample > LEAVES_MISFIT:
+    alone = evidence if len(evidence.reached.steps) == 1 else first_alone(evidence)
+    if found.verdict not in ("attributed", "group") or alone is None or not found.repaired.chi2_per_sample > LEAVES_MISFIT:
         return None
+    if alone is not evidence and found.repaired is not alone.reached.current:
+        return None
+    steps, current = alone.reached.steps, alone.reached.current
     blocks = {t.candidate.block for t in steps[0][1]}
-    current = evidence.reached.current
     learned = better_learned(evidence.plain, current, blocks, evidence.recordings, evidence.bench, task.progress)
     if learned is None:
         return None

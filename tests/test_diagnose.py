@@ -552,4 +552,11 @@ def test_a_learned_function_shows_an_effect_to_be_the_wrong_name(monkeypatch, le
         return module._wrong_name(Task((), None), evidence, SimpleNamespace(verdict=verdict, repaired=repaired))
 
     assert (asked("attributed", named) is learned) == wrong
-    assert asked("nothing_missing", None) is None and asked("attributed", result(1.6)) is None
+    assert asked("nothing_missing", None) is None and asked("attributed", result(1.4)) is None
+    # also where the first of several was named alone
+    single, several = evidence, dataclasses.replace(reached, current=result(2.4), steps=[*reached.steps, *reached.steps])
+    evidence = dataclasses.replace(evidence, reached=several)
+    monkeypatch.setattr(module, "first_alone", lambda e: single)
+    assert (asked("attributed", named) is learned) == wrong and asked("attributed", several.current) is None
+    monkeypatch.setattr(module, "first_alone", lambda e: None)
+    assert asked("attributed", named) is None
