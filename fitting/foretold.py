@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.extrema import nesting
+from magjax.recording import follows_nothing
 
 from .check import beyond_plane
 from .joint import data_jacobian, data_residual
@@ -35,7 +36,7 @@ class Foretold:
 
     log_density: float
     whitened: float
-    expected_rms: tuple[float, ...]
+    expected_rms: tuple[float | None, ...]
 
 
 class Foreteller:
@@ -48,7 +49,7 @@ class Foreteller:
     def places(self) -> tuple[int, ...]:
         """Of the recordings that it goes by."""
         actuator, bench = self.base.actuator, self.base.bench
-        periodic = [k for k, r in enumerate(self.recordings) if r.frequency() is not None]
+        periodic = [k for k, r in enumerate(self.recordings) if r.frequency() is not None and not follows_nothing(r, bench.output)]
         return tuple(k for k in periodic if not beyond_plane(actuator, self.recordings[k], bench) > BEYOND)
 
     @functools.cached_property
@@ -74,6 +75,8 @@ class Foreteller:
         new, old = self(after), self(before)
         if new is None:
             return None
+        if not (np.isfinite(new.log_density) and np.isfinite(old.log_density)):  # a simulation that fails foretells nothing
+            return float(np.isfinite(new.log_density)) - float(np.isfinite(old.log_density))
         return 2 * (new.log_density - old.log_density) / max(min(new.whitened, old.whitened), 1.0)
 
     def beside(self, rows, result) -> list[dict]:
@@ -109,6 +112,8 @@ def foretold(result, spectra) -> Foretold:
         spread[rows, rows] += np.outer(level, level)
     real = slope.any(axis=1) | (residual != 0)
     total = np.eye(len(residual)) + spread
+    if not np.all(np.isfinite(total)) or not np.all(np.isfinite(residual)):
+        return Foretold(-np.inf, np.inf, (None,) * len(spectra))
     root = np.linalg.cholesky(total)
     white = np.linalg.solve(root, residual)
     log_density = -0.5 * white @ white - np.log(np.diag(root)).sum()

@@ -106,6 +106,13 @@ def test_what_does_not_serve_is_left_out(bench, null, plain):
     assert not Foreteller([], plain)
 
 
+def test_a_fit_that_cannot_be_simulated_foretells_nothing(null, plain):
+    solution = dataclasses.replace(plain.solution, z=np.full_like(plain.solution.z, np.nan), normal=np.eye(len(plain.solution.z)))
+    lost, told = dataclasses.replace(plain, solution=solution), Foreteller(null[1], plain)
+    assert told.beside([{}] * 3, lost) == [{"expected_rms": None}] * 3 and told(lost).log_density == -np.inf
+    assert told.says_for(lost, plain) == -1.0 and told.says_for(plain, lost) == 1.0 and told.says_for(lost, lost) == 0.0
+
+
 @pytest.mark.parametrize(
     ("missing", "white", "before", "says", "found"),
     [
