@@ -145,6 +145,11 @@ def settled(task, base, trial, excess, target: float = np.inf) -> Trial:
     return _gone_on(task, base, trial, excess, _further_starts(base, trial), MISFIT)
 
 
+def to_the_end(task, base, candidate, excess):
+    """A trial, settled."""
+    return settled(task, base, try_effect(task, base, candidate, excess), excess)
+
+
 def in_detail(task, base, trial, excess) -> Trial:
     """The trial with the details of its effect's law free whatever it leaves, if these take enough more."""
     return _gone_on(task, base, trial, excess, _details(trial), 0.0)

@@ -36,7 +36,8 @@ from .reach import BEYOND
 from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect, zeros_of
 from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance
 from .rows import DRIFTS
-from .search import screened, search
+from .screen import screened
+from .search import search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
 from .verdict import (

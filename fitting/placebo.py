@@ -13,7 +13,8 @@ from magjax.scale import Chunk, Job, run_job
 
 from .scale.bootstrap import model_lines, parametric_noise
 from .scale.refit import lean
-from .search import screened, search
+from .screen import screened
+from .search import search
 from .task import Task, freed_beyond
 from .verdict import Z_THRESHOLD, too_little
 

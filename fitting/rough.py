@@ -6,7 +6,8 @@ import numpy as np
 
 from .attribute import LIKE_DENSITY, MIN_DROP, SETTLED_CHI2, chi2_of, excess_of
 from .fit import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats
-from .search import SECOND_Z, screened, search
+from .screen import screened
+from .search import SECOND_Z, search
 from .setup import Choices
 from .task import freed_beyond
 from .together import together

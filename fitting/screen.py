@@ -30,6 +30,7 @@ from .columns import (
 )
 from .joint import data_jacobian, data_residual
 from .model import whitened
+from .together import let_go
 from .uncertainty import UNDERSMOOTH
 
 SHAPE_GRIDS = {
@@ -235,3 +236,10 @@ def screen(problem, solution) -> list[Candidate]:
         if effect.name not in best or abs(candidate.z) > abs(best[effect.name].z):
             best[effect.name] = candidate
     return sorted(best.values(), key=lambda c: -abs(c.z))
+
+
+def screened(result, choices) -> list:
+    """Every effect that may be asked for, best first."""
+    found = [c for c in screen(result.problem, result.refined) if c.name not in choices.without]
+    let_go()  # a program an effect, of a density and of other effects that seldom come again
+    return found

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fitting.attribute
+import fitting.exchange
 import fitting.search
 from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of, tie_of
 from fitting.record_level import RecordEffect
@@ -356,7 +357,7 @@ def searched(monkeypatch, ends, follows):
     scores = {id(t.result): [candidate(follows[t.name][0], follows[t.name][1])] for t in trials}
     monkeypatch.setattr(fitting.search, "screened", lambda result, choices: scores[id(result)])
     monkeypatch.setattr(
-        fitting.search, "_to_the_end",
+        fitting.search, "to_the_end",
         lambda task, result, c, excess: next(trial(c.name, follows[t.name][2], 2) for t in trials if t.result is result),
     )  # fmt: skip
     best = trials[0]
@@ -404,7 +405,7 @@ def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypat
     monkeypatch.setattr(fitting.search, "_finer", lambda task, now, best, good, *a: (best, good, task))
     monkeypatch.setattr(fitting.search, "_predicts_worse", lambda *a: worse)
     base.choices, base.actuator = Choices(), SimpleNamespace(effects=())
-    for part in ("_backward", "_exchange", "_commuted"):
+    for part in ("backward", "exchange", "commuted"):
         monkeypatch.setattr(fitting.search, part, lambda *a: None)
     found = fitting.search.search(Task((), None), base, [candidate("excess_loss", 250.0)], check)
     taken = bool(check) and not worse
@@ -439,7 +440,7 @@ def test_the_last_effect_is_dropped_where_it_has_come_out_as_nothing(value, left
     def without(current, fewer, target):
         return Fitted(left if fewer == "magnetic_aftereffect" else 9.0, actuator)
 
-    fitting.search._backward(SimpleNamespace(say=lambda *a: None, fit_on=without), state)
+    fitting.exchange.backward(SimpleNamespace(say=lambda *a: None, fit_on=without), state)
     assert [step[0].name for step in state.steps] == ["rate_dependent_switching", "magnetic_aftereffect"][:kept]
 
 
@@ -466,7 +467,7 @@ def test_what_makes_up_for_a_form_and_makes_the_effect_needless_was_that_effect(
         return fitted(left if fewer == "creep" else 150.0)
 
     task = SimpleNamespace(say=lambda *a: None, fit_on=fit_on)
-    fitting.search._backward(task, state, candidate("magnetic_aftereffect", 20.0))
+    fitting.exchange.backward(task, state, candidate("magnetic_aftereffect", 20.0))
     assert [step[0].name for step in state.steps] == named
     assert state.form == (None if left < 2 else "magnetic_aftereffect")
     if left < 2:
@@ -499,9 +500,9 @@ def test_a_start_from_which_a_fit_ends_worse_than_without_the_effect_is_taken_ne
 def test_where_an_early_effect_is_exchanged_so_may_the_last_be(monkeypatch, changed, asked):
     found = []
     monkeypatch.setattr(
-        fitting.search, "_exchanged", lambda task, state, index, check=(): found.append(index) or (changed and index == 0)
+        fitting.exchange, "_exchanged", lambda task, state, index, check=(): found.append(index) or (changed and index == 0)
     )
-    fitting.search._exchange(None, Reached(None, [None] * 3, {}))
+    fitting.exchange.exchange(None, Reached(None, [None] * 3, {}))
     assert found == asked
 
 
@@ -527,9 +528,9 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
         assert rest.chi2_per_sample == 1.6
         return dataclasses.replace(trial(c.name, ends, base=1.6), result=Result(ends))
 
-    monkeypatch.setattr(fitting.search, "_to_the_end", fitted)
+    monkeypatch.setattr(fitting.exchange, "to_the_end", fitted)
     state = Reached(current, steps, {})
-    assert fitting.search._exchanged(Task((), None), state, 0) is (name == "excess_loss")
+    assert fitting.exchange._exchanged(Task((), None), state, 0) is (name == "excess_loss")
     assert tried == ["excess_loss"] and state.steps[0][0].name == name  # what takes far less is not tried
     assert state.current.chi2_per_sample == min(ends, 1.6)
 
@@ -735,7 +736,7 @@ def test_means_beside_a_slow_effect_are_what_it_has_not_come_to(name, zeros, slo
 )  # fmt: skip
 def test_what_goes_with_a_later_effect_is_sought_anew_where_checks_are_missed(monkeypatch, chi2n, after, known, tried):
     """A delay beside a creep: structural damping imitates both and is adopted first, and the delay was no rival of its."""
-    import fitting.search as module
+    import fitting.exchange as module
 
     def result(value):
         return SimpleNamespace(chi2_per_sample=value, data_count=COUNT, actuator=SimpleNamespace(effect=lambda name: None))
@@ -749,7 +750,7 @@ def test_what_goes_with_a_later_effect_is_sought_anew_where_checks_are_missed(mo
     monkeypatch.setattr(module, "screened", lambda *a: scores)
     monkeypatch.setattr(module, "leaders", lambda candidates: [candidates[0], candidates[2], candidates[3]])
     monkeypatch.setattr(
-        module, "_to_the_end", lambda task, base, c, gap: found.append(c.name) or SimpleNamespace(result=result(0.97))
+        module, "to_the_end", lambda task, base, c, gap: found.append(c.name) or SimpleNamespace(result=result(0.97))
     )
     monkeypatch.setattr(module, "credited", lambda c, *a: trial(c.name, 0.97, base=chi2n))
     monkeypatch.setattr("fitting.task.Task.fit_on", lambda *a, **k: alone)

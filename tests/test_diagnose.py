@@ -141,7 +141,7 @@ def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(mo
     rounds = iter([[trial("creep", fits[1], 1100.0), trial("backlash", fits[1], 900.0)], [trial("backlash", fits[2], 100.0)], []])
     for name, made in {
         "leaders": lambda candidates: candidates, "_trials": lambda *a: next(rounds), "screened": lambda *a: [scored("backlash", 20.0)],
-        "_finer": lambda task, now, best, good, *a: (best, good, task), "_backward": lambda *a: None, "_exchange": lambda *a: None,
+        "_finer": lambda task, now, best, good, *a: (best, good, task), "backward": lambda *a: None, "exchange": lambda *a: None,
     }.items():  # fmt: skip
         monkeypatch.setattr(search_module, name, made)
     reached = search_module.search(Task((), None), fits[0], [scored("creep", 40.0)])

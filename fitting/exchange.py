@@ -1,0 +1,174 @@
+"""What was adopted, once more: an early effect was chosen under the misfit of those that came later.
+
+Effects that these have made needless are dropped, rivals are tried in their place beside all others, and a second mode changes
+places with a filter in the sensor. `state`: a `search.Reached`, which each of them changes.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from magjax.effects import SensorLag
+
+from .attribute import (
+    COMPANIONS,
+    MIN_DROP,
+    MISFIT,
+    Trial,
+    chi2_of,
+    credited,
+    excess_of,
+    leaders,
+    rivals_of,
+    to_the_end,
+)
+from .check import check_errors
+from .instruments import RINGING, mode_as_filter
+from .screen import screened
+from .together import SIDE_BY_SIDE, together
+from .verdict import HALF, NULL_CHI2, misfit
+
+NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within which rivals are tried beside later ones; how many
+NEAR_SHARE = 0.25  # of an early effect's fall, within which too
+PROMISED_ANEW = 0.8  # of what an effect has brought beside the others, that another must promise there to be tried
+NOTHING = 2.0  # standard errors within which an amplitude is none
+
+
+def backward(task, state, made_up=None):
+    """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open.
+    `made_up`: the candidate of `state.form`, which takes the place of what it has made needless.
+
+    The form error of a right effect looks like another effect until the rest is in place. So is the last one dropped where it
+    has come out as nothing: what it seemed to take, the others took when they were fitted once more beside it.
+    """
+    for step in state.steps[::-1]:
+        name = step[0].name
+        actuator = state.current.actuator
+        if name not in {e.name for e in actuator.effects}:
+            continue
+        last = step is state.steps[-1] and not state.form
+        if last and (len(state.steps) == 1 or not _nothing(state.current, name)):
+            continue
+        task.say(f"without {name}", state.current.chi2_per_sample)
+        most = max(chi2_of(state.current) + MIN_DROP, chi2_of(state.current) + excess_of(state.current, NULL_CHI2))
+        trial = task.fit_on(state.current, actuator.without_effect(name), target=most)
+        rise = chi2_of(trial) - chi2_of(state.current)
+        if rise < max(MIN_DROP, HALF * excess_of(trial, NULL_CHI2)):
+            state.current = trial
+            if state.form:
+                state.steps[state.steps.index(step)] = _in_its_place(step, made_up, trial)
+                state.form = None
+            else:
+                state.steps.remove(step)
+
+
+def _in_its_place(step, candidate, result):
+    """The step of an effect that was dropped, with what made up for its form: then the form was not its own."""
+    _, _, good, previous = step
+    effect = result.actuator.effect(candidate.name)
+    found = credited(candidate, result, previous, effect, max(excess_of(previous), MIN_DROP))
+    trials = [found, *(t for t in good if t.name != candidate.name)]
+    return found, rivals_of(found, trials), trials, previous
+
+
+def _nothing(result, name) -> bool:
+    """Whether an effect's amplitude is within its errors of none."""
+    effect = result.actuator.effect(name)
+    found = result.estimate(f"effects.{name}.{effect.amplitude}")
+    return abs(found.value - effect.parameters()[effect.amplitude].null) < NOTHING * (found.stderr or 0.0)
+
+
+def exchange(task, state, check=()):
+    """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
+    that was not theirs. Where that changes one, the same goes for the last."""
+    changed = [_exchanged(task, state, index, check) for index in range(len(state.steps) - 1)]
+    if any(changed):
+        _exchanged(task, state, len(state.steps) - 1)
+
+
+def _exchanged(task, state, index, check=()) -> bool:
+    """The best of an effect adopted and its near rivals, beside all others; whether it is another."""
+    best, _, good, previous = state.steps[index]
+    behind = max(NEAR_RIVAL * chi2_of(best.result), NEAR_SHARE * best.drop)
+    others = {e.name for e in state.current.actuator.effects} - {best.name}
+    near = [t for t in good if t is not best and t.name not in others and t.bic_change < best.bic_change + behind]
+    if best.name not in {e.name for e in state.current.actuator.effects}:
+        return False
+    rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
+    fresh = _promised_anew(task, state.current, rest, {best.name, *others, *(t.name for t in near)}, check)
+    if not near and not fresh:
+        return False
+    cost = best.parameters * np.log(rest.data_count)
+    trials = [Trial(best.candidate, state.current, 0.0, cost, True, best.explained_share, best.parameters)]
+    near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
+
+    def beside(t):
+        return lambda say: to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP)
+
+    for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
+        trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
+    trials = [t for t in trials + fresh if t.physical]
+    found = min(trials, key=lambda t: t.bic_change)
+    state.steps[index] = (found, rivals_of(found, trials), trials, previous)
+    state.current = found.result
+    return found.name != best.name
+
+
+def _promised_anew(task, current, rest, known, check) -> list[Trial]:
+    """Effects that a screening beside the others alone promises to serve as well as the one adopted with them, fitted, where the
+    check recordings are missed though the noise is met. `rest`: the current fit without that one; `known`: those tried.
+
+    An effect that imitates two is adopted first, and neither of them need be among its rivals then.
+    """
+    if not check or current.chi2_per_sample > MISFIT or not _missed(current, check, task.bench):
+        return []
+    task.say("what else goes with the others", current.chi2_per_sample)
+    base = task.fit_on(rest, rest.actuator)
+    gap = max(chi2_of(base) - chi2_of(current), MIN_DROP)
+    candidates = screened(base, task.choices)
+    promised = [c for c in leaders(candidates) if c.name not in known and c.z**2 > PROMISED_ANEW * gap][:SIDE_BY_SIDE]
+    kin = {name for c in promised for name in COMPANIONS.get(c.name, ())} - known - {c.name for c in promised}
+    trials = []
+    for c in (*promised, *(c for c in candidates if c.name in kin)):
+        result = to_the_end(task, base, c, gap).result
+        trials.append(credited(c, result, current, result.actuator.effect(c.name), gap))
+    return trials
+
+
+def _missed(result, check, bench) -> bool:
+    """Whether check recordings are foretold to worse than 1.4 of their noise, in the mean of the squares."""
+    rows = check_errors(result.actuator, result.actuator, check, bench)
+    return misfit(rows, "rms_after") > len(rows)
+
+
+def commuted(task, state, candidate) -> bool:
+    """A second mode of the rod may be the rod itself, and what passed for the rod a filter in its sensor: linear filters commute.
+
+    Tried from where the two have changed places, which no fit from the base's optimum reaches. Whether the filter was adopted.
+    """
+    index = next((k for k, step in enumerate(state.steps) if step[0].name == "second_mode"), None)
+    names, held = ("mechanics.f0", "mechanics.xi"), {e.name for e in state.current.actuator.effects}
+    if index is None or candidate is None or "second_mode" not in held or "sensor_lag" in held:
+        return False
+    if set(names) & set(task.bench.priors) or not set(names) <= set(task.bench.free):
+        return False
+    estimate = state.current.estimate
+    modes = [tuple(estimate(n).value for n in names), tuple(estimate(f"effects.second_mode.{n}").value for n in ("f2", "xi2"))]
+    rod, sensor = sorted(modes, key=lambda mode: mode[1])
+    if sensor[1] < RINGING:
+        return False
+    task.say("a filter in the sensor in place of a second mode", state.current.chi2_per_sample)
+    actuator = state.current.actuator.without_effect("second_mode").replace(dict(zip(names, rod, strict=True)))
+    actuator = actuator.with_effect(SensorLag(*mode_as_filter(*sensor)))
+    result = task.fit_on(state.current, actuator)
+    best, rivals, _, previous = state.steps[index]
+    excess = max(excess_of(previous), MIN_DROP)
+    own, swapped = (
+        credited(c, r, previous, r.actuator.effect(c.name), excess)
+        for c, r in ((best.candidate, state.current), (candidate, result))
+    )
+    found = min((own, swapped), key=lambda t: t.bic_change)
+    trials = [own, swapped, *(t for t in rivals if t.name not in ("second_mode", "sensor_lag"))]
+    state.steps[index] = (found, rivals_of(found, trials), trials, previous)
+    state.current = found.result
+    return found is swapped
