@@ -200,9 +200,15 @@ def _physical(effect, result) -> bool:
     """Whether an effect's amplitude has a sign and a size that it can have, and it is what it is named for; an amplitude that
     ends in a bound of its own may run on."""
     info = effect.parameters()[effect.amplitude]
-    amplitude = result.estimate(f"effects.{effect.name}.{effect.amplitude}").value
     largest = OUT_OF_REACH * max(map(abs, info.typical)) if info.typical and np.isinf(info.high) else np.inf
-    return abs(amplitude) <= largest and (amplitude >= 0 or info.low < 0) and effect.is_itself()
+    signed = info.low < 0 or float(getattr(effect, effect.amplitude)) >= 0
+    return signed and effect.extent(_readings(result.spectra), result.actuator) <= largest and effect.is_itself()
+
+
+def _readings(spectra) -> tuple[float, float]:
+    """The lowest and the highest reading."""
+    ends = [float(s.reading[0].real) + side * s.peak_to_peak / 2 for s in spectra for side in (-1, 1)]
+    return min(ends), max(ends)
 
 
 def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:

@@ -37,6 +37,7 @@ class Choices:
     harmonics: int = HARMONICS
     max_jacobians: int = 30
     without: tuple[str, ...] = ()  # effects that a diagnosis does not ask for: their instrument was measured
+    only: tuple[str, ...] = ()  # the effects that it does ask for, where these are named
     rest: str = "auto"  # start memory: "negative", "demagnetized" about the drive's zero, "virgin": about no field, "positive", or tried in turn
     touching: bool = False  # start from loops whose M may turn its sign wherever the strain comes near zero
 

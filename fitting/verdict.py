@@ -286,6 +286,12 @@ def unconfirmed(reached):
 
 
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
+    asked = {c.name for c in evidence.candidates}
+    if asked and asked <= set(evidence.absorbed):  # of the whole catalogue some would always show
+        seen = ", ".join(f"{c.name} ({c.visibility:.2g} of it)" for c in evidence.candidates)
+        text = f"these recordings cannot tell whether it is there, for the density does the same but for a little: {seen}."
+        text += f" The fit stands at chi2/N = {evidence.excess:.2f} without it; another channel has to show it, the flux in a pick-up coil for one."
+        return Diagnosis("absorbed", text, **common)
     text = f"no effect of the catalogue was found: chi2/N = {evidence.excess:.2f} and "
     if dropped:
         text += f"{dropped}, which serves best, takes less than half of what is above the noise."

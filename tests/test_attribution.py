@@ -9,7 +9,7 @@ import pytest
 import fitting.attribute
 import fitting.exchange
 import fitting.search
-from fitting.attribute import Trial, chi2_of, confidence, family, leaders, rivals_of, tie_of
+from fitting.attribute import Trial, _physical, chi2_of, confidence, family, leaders, rivals_of, tie_of
 from fitting.record_level import RecordEffect
 from fitting.rows import behind, creeps_on, sizes_of, ties_of
 from fitting.screen import Candidate
@@ -280,11 +280,27 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
 )  # fmt: skip
 def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
     """One far beyond what is typical imitates another law; a share that has reached its bound may run on."""
-    from fitting.attribute import _physical
+    assert _physical(CLASSES[name]().with_amplitude(amplitude), a_fit_of((0.0, 5e-5))) == physical
 
-    effect = CLASSES[name]()
-    result = SimpleNamespace(estimate=lambda parameter: SimpleNamespace(value=amplitude))
-    assert _physical(effect, result) == physical
+
+def a_fit_of(readings, reach=6.7e-5):
+    low, high = readings
+    spectrum = SimpleNamespace(reading=np.array([(low + high) / 2 + 0j]), peak_to_peak=high - low)
+    return SimpleNamespace(spectra=[spectrum], actuator=SimpleNamespace(strained=SimpleNamespace(reach=reach)))
+
+
+@pytest.mark.parametrize(
+    ("curve", "physical"),
+    [
+        (CLASSES["sensor_nonlinearity"](q2=7.27, c3=-6.8, c4=21.8, c5=-32.7, c6=18.6, c0=1e-3), True),
+        (CLASSES["sensor_nonlinearity"](q2=-0.1), True),
+        (CLASSES["sensor_nonlinearity"](q2=20.0), False),
+    ],
+    ids=["half as much again", "a little less", "many times as much"],
+)
+def test_a_sensors_curve_is_as_large_as_its_departure_over_the_motion(curve, physical):
+    """Two Legendre terms on blocks ended at q2 = 7, of which the motion reached a third, and were thought impossible."""
+    assert _physical(curve, a_fit_of((0.0, 8.7e-5), 9.2e-5)) is physical
 
 
 @pytest.mark.parametrize(
@@ -304,12 +320,7 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
 def test_a_law_bent_into_another_is_not_named(effect, physical):
     """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop, friction that
     is viscous throughout a delay beside a creep."""
-    from fitting.attribute import _physical
-
-    assert (
-        _physical(effect, SimpleNamespace(estimate=lambda name: SimpleNamespace(value=float(getattr(effect, effect.amplitude)))))
-        is physical
-    )
+    assert _physical(effect, a_fit_of((0.0, 5e-5))) is physical
 
 
 @pytest.mark.parametrize(

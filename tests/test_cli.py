@@ -227,6 +227,8 @@ def test_wrong_use(tmp_path, capsys):
     assert f"{blocked / 'below'}: cannot be written" in error and "--out" in error and "\n" not in error
     assert main(["simulate", "--amplitude", "9", "--out", str(tmp_path / "s.nc"), "--quiet"]) == 2
     assert "outside the Preisach plane" in capsys.readouterr().err
+    assert main(["diagnose", "rec.csv", "--bench", "aa-050h", "--only", "villari"]) == 2
+    assert 'no effect "villari"; the catalogue has amplifier_lag' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", COMMANDS)

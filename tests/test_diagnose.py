@@ -64,6 +64,19 @@ def test_silent_where_nothing_is_missing(bench):
             "next_experiment", "placebo", "message", "base", "repaired", "ties"} == set(content)  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [(("mean_field", "linear_strain"), "absorbed"), (("mean_field", "sensor_lag"), "nothing_missing"), (("mains_hum",), "nothing_missing")],
+    ids=["what the density hides", "one that would show", "one between the harmonics"],
+)  # fmt: skip
+def test_effects_that_are_asked_for_alone(bench, asked, said):
+    runs, _ = study(bench)
+    found = diagnose(runs, bench, choices=Choices(fine=250, only=asked))
+    assert found.verdict == said and {c.name for c in found.candidates} <= set(asked)
+    assert set(found.absorbed) == set(asked) & {"mean_field", "linear_strain"}
+    assert said != "absorbed" or ("mean_field" in found.message and "pick-up coil" in found.message)
+
+
 @pytest.mark.long
 def test_the_base_of_a_diagnosis_is_that_on_the_finer_density_that_was_asked_for(bench):
     runs, checks = study(bench)

@@ -128,10 +128,9 @@ class BenchResponse:
 
 def effect_of(name: str, parameters: dict):
     """An effect of the catalogue by name; raises `ConfigurationError` naming what there is."""
-    from ..effects import CLASSES
+    from ..effects import CLASSES, refuse_unknown
 
-    if name not in CLASSES:
-        raise ConfigurationError(f'no effect "{name}"; the catalogue has {", ".join(CLASSES)}')
+    refuse_unknown([name])
     known = CLASSES[name].parameters()
     for key, value in parameters.items():
         if key not in known:

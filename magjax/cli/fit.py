@@ -171,12 +171,15 @@ def run_diagnose(arguments) -> int:
         default=[],
         help="the sensor moved by a known amount: files with reference_m beside the reading",
     )
+    p.add_argument("--only", nargs="+", action="extend", default=[], metavar="EFFECT",
+                   help="ask for these effects alone (`docs/effects.md` has the names); drift, heat and hum are told in any case")  # fmt: skip
     p.add_argument("--placebo", type=int, default=0, metavar="N",
                    help="search N simulations of the final model for what they do not lack: how often the search cries wolf (some seconds each, more where the screening alarms)")  # fmt: skip
     add_where(p, "the placebo's finished searches")
     options = p.parse_args(arguments)
     check_placebo(options)
     prepare_jax()
+    from magjax.effects import refuse_unknown
     from magjax.errors import RecordingError
     from magjax.readers import load_calibrations, load_checks, load_sound, refuse_absent_and_twice
 
@@ -184,6 +187,9 @@ def run_diagnose(arguments) -> int:
     folder = output_folder(options.out)
     if bench.output == "strain" and options.placebo:
         raise ConfigurationError("--placebo simulates recordings, and strain curves have a law instead; leave it out")
+    refuse_unknown(options.only)
+    if bench.output == "strain" and options.only:
+        raise ConfigurationError("--only asks for effects, and strain curves have a law instead; leave it out")
     refuse_absent_and_twice(options.recordings, options.check, options.calibration)
     if bench.output == "strain":
         return _diagnose_strain(options, bench, folder)
@@ -199,7 +205,7 @@ def run_diagnose(arguments) -> int:
         checks, refused = load_checks(options.check, bench)
         with Progress(options.quiet) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
-                             choices=Choices(max_jacobians=options.max_jacobians), progress=progress).without_checks(refused)  # fmt: skip
+                             choices=Choices(max_jacobians=options.max_jacobians, only=tuple(options.only)), progress=progress).without_checks(refused)  # fmt: skip
             if options.placebo and found.verdict != "data_problem":
                 try:
                     found = with_placebo(found, [*recordings, *found.parted(checks)[0]], options, progress)

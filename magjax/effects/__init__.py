@@ -1,5 +1,6 @@
 """The catalogue of physics that T&B leave out: one file each. Adding an effect is one new file and one line here."""
 
+from ..errors import ConfigurationError
 from .accommodation import Accommodation
 from .amplifier_clipping import AmplifierClipping
 from .amplifier_lag import AmplifierLag
@@ -65,4 +66,12 @@ CATALOGUE = (
 
 CLASSES = {effect.name: effect for effect in CATALOGUE}
 
-__all__ = ["CATALOGUE", "CLASSES", "AbstractEffect", "Trial"]
+
+def refuse_unknown(names) -> None:
+    """Raises `ConfigurationError` at the first name that no effect has."""
+    for name in names:
+        if name not in CLASSES:
+            raise ConfigurationError(f'no effect "{name}"; the catalogue has {", ".join(CLASSES)}')
+
+
+__all__ = ["CATALOGUE", "CLASSES", "AbstractEffect", "Trial", "refuse_unknown"]

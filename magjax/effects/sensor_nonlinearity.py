@@ -1,5 +1,6 @@
 """sensor: its characteristic is not straight."""
 
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..param import param
@@ -32,6 +33,19 @@ class SensorNonlinearity(AbstractEffect):
     source = "linearity error of LVDTs, as in their data sheets"
     signature = "distortion that is a function of y alone at every frequency; a free density absorbs it at low frequency"
     amplitude = "q2"
+
+    def extent(self, readings, actuator) -> float:
+        """Largest departure relative to the largest motion, over the motion that makes the readings: a polynomial may run far
+        outside it."""
+        largest = max(np.max(np.abs(readings)), 1e-300)
+        departures, motions = [], []
+        for side in (-1.0, 1.0):
+            y = side * largest * np.linspace(0, 2, 401)
+            read = np.asarray(self.reading(y, None, None, actuator))
+            seen = np.cumprod((y == 0) | (read >= readings[0]) & (read <= readings[1]))
+            departures.append(np.max(seen * np.abs(read - y)))
+            motions.append(np.max(seen * np.abs(y)))
+        return float(max(departures) / max(*motions, 1e-3 * largest))
 
     def reading(self, reading, signals, line, actuator):
         """Reading through the curve."""
