@@ -42,7 +42,7 @@ class SensorNonlinearity(AbstractEffect):
         for side in (-1.0, 1.0):
             y = side * largest * np.linspace(0, 2, 401)
             read = np.asarray(self.reading(y, None, None, actuator))
-            seen = np.cumprod((y == 0) | (read >= readings[0]) & (read <= readings[1]))
+            seen = np.cumprod((y == 0) | (read >= readings[0]) & (read <= readings[1]) & (side * (read - read[0]) >= 0))
             departures.append(np.max(seen * np.abs(read - y)))
             motions.append(np.max(seen * np.abs(y)))
         return float(max(departures) / max(*motions, 1e-3 * largest))
