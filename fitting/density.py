@@ -14,6 +14,7 @@ import numpy as np
 R_EXPONENT = 1.6
 TAIL = 0.5
 RIDGE = 0.3  # beside second differences
+COLUMNS = 114  # unknowns that a program takes at once: none depends on how many there are
 
 
 def on_device(values):
@@ -45,18 +46,23 @@ class DensityBasis:
     @functools.cached_property
     def tables(self) -> np.ndarray:
         """Everett values of every hat at total mass 1, as `magjax.preisach.everett` has them, (unknowns, size + 1, size + 1)."""
-        L = self.size
-        cube = np.ascontiguousarray(self.cells.T).reshape(-1, L, L)
-        values = np.zeros((len(cube), L + 1, L + 1))
-        values[:, 1:, :L] = np.cumsum(np.cumsum(cube, axis=1)[:, :, ::-1], axis=2)[:, :, ::-1]
-        k = np.arange(L)
-        values[:, k, k + 1] = cube[:, k, k]
-        return values
+        return np.concatenate(self.placed[1])[: self.unknowns]
 
     @functools.cached_property
     def placed(self) -> tuple:
-        """Cells, tables and penalties as JAX arrays: every fit on this basis shares them."""
-        return on_device(self.cells), on_device(self.tables), tuple(on_device(D) for D in self.penalties)
+        """Masses and Everett values of the hats, `COLUMNS` at a time and the last filled up with none, and penalties as JAX
+        arrays: every fit on this basis shares them."""
+        L, parts = self.size, ([], [])
+        for first in range(0, self.unknowns, COLUMNS):
+            some = self.cells[:, first : first + COLUMNS].T.reshape(-1, L, L)
+            cubes, values = np.zeros((COLUMNS, L, L)), np.zeros((COLUMNS, L + 1, L + 1))
+            cubes[: len(some)] = some
+            values[:, 1:, :L] = np.cumsum(np.cumsum(cubes, axis=1)[:, :, ::-1], axis=2)[:, :, ::-1]
+            k = np.arange(L)
+            values[:, k, k + 1] = cubes[:, k, k]
+            for part, held in zip(parts, (cubes, values), strict=True):
+                part.append(on_device(held))
+        return *map(tuple, parts), tuple(on_device(D) for D in self.penalties)
 
     @property
     def unknowns(self) -> int:

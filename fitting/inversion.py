@@ -13,7 +13,7 @@ def mass_errors(result) -> np.ndarray:
     layout = result.problem.layout
     n = layout.density_unknowns
     hats = covariance(result.solution.normal, result.solution.z, layout)[:n, :n]
-    cells = np.asarray(layout.cells)
+    cells = np.concatenate(layout.cells)[:n].reshape(n, -1).T
     variance = np.einsum("ij,jk,ik->i", cells, hats, cells, optimize=True)
     side = int(round(np.sqrt(len(cells))))
     return WIDEN * float(layout.total) * np.sqrt(np.maximum(variance, 0.0)).reshape(side, side)

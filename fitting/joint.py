@@ -18,7 +18,8 @@ from scipy.sparse.csgraph import structural_rank
 from magjax.programs import kept
 
 from .model import Layout, Predictor, Target, whitened
-from .solver import CHUNK, SteppedLevenbergMarquardt, cost_of, pushed
+from .passes import Passes
+from .solver import SteppedLevenbergMarquardt, cost_of
 from .together import together
 
 WEIGHT_RANGE = (1e-3, 1e9)
@@ -58,15 +59,9 @@ class Problem:
         return int(2 * finite.sum() - finite[:, 0].sum())
 
     @functools.cached_property
-    def marching(self) -> tuple:
-        """The part of the problem up to the magnetization: layout and template without the effects behind it, and where its
-        unknowns stand in z. All fits that differ in those effects alone share its compiled program, the larger part by far."""
-        template = self.template
-        behind = {e.name for e in template.effects if not e.marches}
-        layout, place = self.layout.without(
-            {n for n in self.layout.names if n.startswith("effects.") and n.split(".")[1] in behind}
-        )
-        return layout, dataclasses.replace(template, effects=tuple(e for e in template.effects if e.marches)), place
+    def passes(self) -> Passes:
+        """Its residual and Jacobian."""
+        return Passes(self)
 
     def with_weights(self, weights) -> "Problem":
         """The same problem with other roughness weights."""
@@ -92,82 +87,24 @@ class Solution:
     interrupted: bool = False
 
 
-@kept
-def _march(layout, z, template, predictor):
-    return predictor.march(layout.actuator(template, z, layout.plane(z)), layout.levels(z))
-
-
-@kept
-def _march_tangents(layout, z, template, predictor):
-    """Fields and magnetizations, and their change with each unknown, (unknowns, recordings, samples) per grid."""
-    if layout.held is not None:  # few unknowns, none of them the density's
-        marched, push = jax.linearize(lambda y: predictor.march(layout.actuator(template, y), layout.levels(y)), z)
-        return marched, pushed(push, jnp.eye(z.shape[0]))
-    n = layout.density_unknowns
-
-    def march(masses, values, rest):
-        y = jnp.concatenate([jax.lax.stop_gradient(z[:n]), rest])
-        return predictor.march(layout.actuator(template, y, (masses, values)), layout.levels(y))
-
-    masses, values = layout.plane(z)
-    marched, push = jax.linearize(march, masses, values, z[n:])
-    return marched, _every_unknown(push, layout, masses.shape, z.shape[0] - n)
-
-
-def _every_unknown(push, layout, shape, others: int):
-    """A linear function of masses, Everett values and the `others` unknowns, for each unknown of the layout.
-
-    Each hat's masses and Everett values are known: no product with the unit vectors, no sums over the plane.
-    """
-    n = layout.density_unknowns
-    chunks = -(-n // CHUNK)
-    size = -(-n // chunks)
-    last = -(-others // size)
-    rest = jnp.zeros((last * size, others)).at[:others].set(jnp.eye(others)).reshape(last, size, others)
-
-    def of_chunk(k):
-        hats, at = k < chunks, jnp.minimum(k * size, n - size)
-        masses = jnp.where(hats, layout.total * jax.lax.dynamic_slice_in_dim(layout.cells, at, size, 1).T, 0.0)
-        values = jnp.where(hats, layout.total * jax.lax.dynamic_slice_in_dim(layout.tables, at, size), 0.0)
-        unit = jnp.where(hats, 0.0, rest[jnp.maximum(k - chunks, 0)])
-        return jax.vmap(push)(masses.reshape(size, *shape), values, unit)
-
-    rows = jax.lax.map(of_chunk, jnp.arange(chunks + last))
-    before = (chunks - 1) * size
-    # the last chunk of hats begins early, so as to end with them
-    order = np.concatenate([np.arange(before), chunks * size - n + np.arange(before, n), chunks * size + np.arange(others)])
-    return jax.tree.map(lambda r: r.reshape(-1, *r.shape[2:])[order], rows)
-
-
-@kept
-def _read_residual(layout, z, target, template, predictor, marched):
-    return whitened(predictor.lines(layout.actuator(template, z), marched), target)
-
-
-@kept
-def _read_jacobian(layout, z, target, template, predictor, marched, tangents, place):
-    """The Jacobian from the tangents of the march, those of unknowns `place`; the others do not move it."""
-    n = z.shape[0]
-    _, push = jax.linearize(lambda y, fields: whitened(predictor.lines(layout.actuator(template, y), fields), target), z, marched)
-    tangents = jax.tree.map(lambda t: jnp.zeros((n, *t.shape[1:])).at[place].set(t), tangents)
-    return pushed(lambda given: push(*given), (jnp.eye(n), tangents)).T
-
-
 def data_residual(problem: Problem, z):
     """Whitened misfit of the harmonics on the fine grid."""
-    z, predictor = np.asarray(z, float), problem.predictors[1]
-    layout, template, place = problem.marching
-    marched = _march(layout, jnp.asarray(z[place]), template, predictor)
-    return np.asarray(_read_residual(problem.layout, jnp.asarray(z), problem.target, problem.template, predictor, marched))
+    return problem.passes.residual(z)
 
 
 def fields(problem: Problem, z) -> list:
     """Drive, field H and magnetization M of every recording over a period of the fine grid, as fitted: [(drive, H, M)], (samples,)."""
-    predictor, z = problem.predictors[1], np.asarray(z, float)
-    layout, template, place = problem.marching
-    marched = _march(layout, jnp.asarray(z[place]), template, predictor)
-    rows = [row for drives, (H, M) in zip(predictor.drives, marched, strict=True) for row in zip(drives, H, M, strict=True)]
-    return [tuple(np.asarray(x) for x in rows[k]) for k in predictor.index]
+    return problem.passes.fields(z)
+
+
+def data_jacobian(problem: Problem, z):
+    """Its Jacobian, (data, unknowns), on the coarse grid."""
+    return problem.passes.jacobian(z)
+
+
+def compiled(problem: Problem, z) -> None:
+    """Compile what a fit from z needs, side by side."""
+    together(problem.passes.compiling(z))
 
 
 @kept
@@ -182,31 +119,6 @@ def data_residuals(problem: Problem, z, lines):
     (problems, data) for (problems, unknowns) and (problems, recordings, harmonics + 1)."""
     arguments = (problem.layout, jnp.asarray(z), jnp.asarray(lines), problem.target, problem.template, problem.predictors[1])
     return np.asarray(_read_residuals(*arguments))
-
-
-def data_jacobian(problem: Problem, z):
-    """Its Jacobian, (data, unknowns), on the coarse grid."""
-    z, predictor = np.asarray(z, float), problem.predictors[0]
-    layout, template, place = problem.marching
-    marched, tangents = _march_tangents(layout, jnp.asarray(z[place]), template, predictor)
-    return np.asarray(_read(problem, z, marched, tangents))
-
-
-def _read(problem, z, marched, tangents):
-    place = problem.marching[2]
-    arguments = (problem.layout, jnp.asarray(z), problem.target, problem.template, problem.predictors[0], marched, tangents)
-    return _read_jacobian(*arguments, jnp.asarray(place))
-
-
-def compiled(problem: Problem, z) -> None:
-    """Compile what a fit from z needs, side by side: to read a march's tangents does not wait for them."""
-
-    def of_nothing(_):
-        unknowns = len(problem.marching[2])
-        still = tuple((np.zeros(d.shape),) * 2 for d in problem.predictors[0].drives)
-        _read(problem, z, still, jax.tree.map(lambda x: np.zeros((unknowns, *x.shape)), still))
-
-    together([lambda _: data_residual(problem, z), lambda _: data_jacobian(problem, z), of_nothing])
 
 
 def evidence_weights(layout: Layout, z, normal, weights):

@@ -17,8 +17,9 @@ from magjax.preisach import Preisach
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
-from .density import DensityBasis, on_device
+from .density import COLUMNS, DensityBasis, on_device
 
+ROWS, MOST_ROWS = 5, 15  # a program takes whole ROWS of recordings, the last of them repeated, and no more at once
 MEMORY = 3e-4  # of the total; prior deviation of each recording's level of M
 
 
@@ -33,8 +34,8 @@ class Layout(eqx.Module):
     one compiled program.
     """
 
-    cells: jax.Array
-    tables: jax.Array  # Everett values of the cells of every unknown, (density unknowns, levels, levels)
+    cells: tuple[jax.Array, ...]  # of the density's unknowns, COLUMNS at a time: masses at a total of 1, (COLUMNS, cells, cells)
+    tables: tuple[jax.Array, ...]  # and their Everett values, (COLUMNS, levels, levels)
     penalties: tuple[jax.Array, ...]
     total: jax.Array
     starts: jax.Array
@@ -43,6 +44,7 @@ class Layout(eqx.Module):
     highs: jax.Array
     names: tuple[str, ...] = eqx.field(static=True)
     log: tuple[bool, ...] = eqx.field(static=True)
+    density_unknowns: int = eqx.field(static=True)
     memories: int = eqx.field(static=True, default=0)
     held: jax.Array | None = None
 
@@ -51,14 +53,9 @@ class Layout(eqx.Module):
         """From a density basis and the free parameters' names, start values, scales, bounds and coordinate kinds."""
         return Layout(
             *basis.placed, on_device(basis.total),
-            on_device(starts), on_device(scales), on_device(lows), on_device(highs), tuple(names), tuple(log), memories,
+            on_device(starts), on_device(scales), on_device(lows), on_device(highs), tuple(names), tuple(log), basis.unknowns, memories,
             None if basis.held is None else on_device(basis.held),
         )  # fmt: skip
-
-    @property
-    def density_unknowns(self) -> int:
-        """How many of the unknowns are the density's."""
-        return self.cells.shape[1]
 
     @property
     def size(self) -> int:
@@ -107,17 +104,6 @@ class Layout(eqx.Module):
             return float(np.log(value / self.starts[k]))
         return float((value - self.starts[k]) / self.scales[k])
 
-    def without(self, dropped) -> tuple["Layout", np.ndarray]:
-        """The layout without some of the parameters, and where its unknowns stand in this one."""
-        kept = [k for k, name in enumerate(self.names) if name not in dropped]
-        n = self.density_unknowns + 1
-        place = np.concatenate([np.arange(n), n + np.asarray(kept, int), np.arange(n + len(self.names), self.size)])
-        if len(kept) == len(self.names):
-            return self, place
-        numbers = {x: jnp.asarray(np.asarray(getattr(self, x))[kept]) for x in ("starts", "scales", "lows", "highs")}
-        names, log = (tuple(x[k] for k in kept) for x in (self.names, self.log))
-        return dataclasses.replace(self, **numbers, names=names, log=log), place
-
     def levels(self, z):
         """What each recording's start transient adds to M, A/m, (recordings,) or None."""
         return MEMORY * self.total * z[self.size - self.memories :] if self.memories else None
@@ -126,26 +112,24 @@ class Layout(eqx.Module):
         """The Preisach masses, A/m, (levels - 1, levels - 1)."""
         if self.held is not None:
             return self.held
-        side = self.tables.shape[1] - 1
-        return (self.total * (self.cells @ z[: self.density_unknowns])).reshape(side, side)
+        return self._summed(z, self.cells)
 
     def plane(self, z):
-        """Masses and their Everett values at the levels, A/m, as sums over the basis, whose own are known; None where they are held."""
-        if self.held is not None:
-            return None
-        return self.masses(z), self.total * jnp.tensordot(z[: self.density_unknowns], self.tables, 1)
+        """Masses and their Everett values at the levels, A/m, in NumPy, as sums over the basis, whose own are known."""
+        return tuple(self._summed(z, x, np) for x in (self.cells, self.tables))
 
-    def actuator(self, template, z, plane=None):
-        """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable).
+    def _summed(self, z, parts, xp=jnp):
+        """Over the density's unknowns. `xp`: jax.numpy or numpy."""
+        heights = xp.concatenate([z[: self.density_unknowns], xp.zeros(len(parts) * COLUMNS - self.density_unknowns)])
+        return xp.asarray(self.total) * sum(
+            xp.tensordot(heights[k * COLUMNS : (k + 1) * COLUMNS], xp.asarray(part), 1) for k, part in enumerate(parts)
+        )
 
-        `plane`: masses and their Everett values, A/m, instead of those that z describes.
-        """
-        masses = self.masses(z) if plane is None else plane[0]
-        mass = jnp.sum(masses) if plane is None else plane[1][-1, 0]
-        offset = self.total * z[self.density_unknowns] + mass
+    def actuator(self, template, z):
+        """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable)."""
+        masses = self.masses(z)
+        offset = self.total * z[self.density_unknowns] + jnp.sum(masses)
         template = eqx.tree_at(lambda a: (a.hysteresis.masses, a.hysteresis.offset), template, (masses, offset))
-        if plane is not None:
-            template = eqx.tree_at(lambda a: a.hysteresis, template, template.hysteresis.with_values(plane[1], masses))
         values = {name: self.value(name, z) for name in self.names}
         return template.replace(values) if values else template
 
@@ -219,6 +203,19 @@ class Predictor(eqx.Module):
             at += drive.shape[0]
         return tuple(parts)
 
+    def batches(self):
+        """The same in parts of whole `ROWS` recordings on one grid, the last repeated: yields (predictor, places of its recordings)."""
+        members, at = np.argsort(np.asarray(self.index)), 0
+        for drives, steps in zip(self.drives, self.steps, strict=True):
+            drives, steps = np.asarray(drives), np.asarray(steps)
+            rows = -(-len(drives) // ROWS) * ROWS
+            rows = rows if rows <= MOST_ROWS else 2 * ROWS
+            for first in range(0, len(drives), rows):
+                some = np.minimum(np.arange(first, first + rows), len(drives) - 1)
+                part = dataclasses.replace(self, drives=(drives[some],), steps=(steps[some],), index=tuple(range(rows)))
+                yield part, members[at + first : at + min(first + rows, len(drives))]
+            at += len(drives)
+
     def lines_of_each(self, actuators, levels):
         """As `self(actuator, levels)` for several actuators, the leading axis of every array: (actuators, recordings, harmonics + 1).
 
@@ -277,12 +274,15 @@ class Target(eqx.Module):
     gain_shares: jax.Array  # (recordings, recordings), what uncertain scales take off the misfits along them
 
 
-def whitened(lines, target: Target):
-    """Real residual vector of complex lines: (model - measured) / deviation, mean lines real, uncertain scales taken off."""
+def whitened(lines, target: Target, xp=jnp):
+    """Real residual vector of complex lines: (model - measured) / deviation, mean lines real, uncertain scales taken off.
+
+    `lines`: (..., recordings, harmonics + 1); `xp`: jax.numpy, or numpy with a target of its arrays.
+    """
     misfit = (lines - target.lines) / target.deviations
-    along = jnp.sum((jnp.conj(target.gain_rows) * misfit).real, axis=1)
-    misfit = misfit - (target.gain_shares @ along)[:, None] * target.gain_rows
-    return jnp.concatenate([misfit.real.ravel(), misfit[:, 1:].imag.ravel()])
+    along = xp.sum((xp.conj(target.gain_rows) * misfit).real, axis=-1)
+    misfit = misfit - (along @ target.gain_shares.T)[..., None] * target.gain_rows
+    return xp.concatenate([part.reshape(*part.shape[:-2], -1) for part in (misfit.real, misfit[..., 1:].imag)], axis=-1)
 
 
 def make_start_actuator(template, basis: DensityBasis, rest=None):

@@ -1,6 +1,5 @@
-"""The screening's first-order columns, and the fit's derivatives, against derivatives of the whole chain."""
+"""The screening's first-order columns against derivatives of the whole chain."""
 
-import dataclasses
 
 import equinox as eqx
 import jax
@@ -9,8 +8,7 @@ import numpy as np
 import pytest
 
 import magjax.effects as effects
-from fitting.demo import concealed_actuator, record
-from fitting.joint import _march_tangents
+from fitting.demo import record
 from fitting.model import predicted_lines, whitened
 from fitting.screen import applicable, columns, shape_grid
 from fitting.setup import Choices, build_problem, free_parameters, spectra_of
@@ -58,32 +56,3 @@ def test_are_those_of_the_whole_chain(recordings, kinds):
         assert np.linalg.norm(whole) > 0
         near = 0.1 if kind is effects.AmplifierClipping else 1e-6  # all of the change of the drive, carried on to first order
         assert np.linalg.norm(column - whole) < near * np.linalg.norm(whole), kind.name
-
-
-@pytest.mark.parametrize("rest", ["negative", "demagnetized"])
-def test_the_changes_with_the_unknowns_are_those_of_the_march(rest):
-    """Against pushing unit vectors through the actuator that the unknowns make, to rounding."""
-    bench = load_bench("aa-050h")
-    truth = concealed_actuator(bench)
-    rng = np.random.default_rng(2)
-    recordings = [record(truth, f, 0.6, 0.0, rng, f"{f}") for f in (20, 200)]
-    actuator = bench.actuator().with_effect(effects.ExcessLoss(k=10.0))
-    names = free_parameters(bench, actuator, ("effects.excess_loss.k",))
-    spectra = spectra_of(recordings, bench, SMALL.harmonics)
-    problem, z = build_problem(spectra, actuator, bench, names, dataclasses.replace(SMALL, rest=rest), None)
-    layout, template, place = problem.marching
-    predictor = problem.predictors[0]
-    marched, changes = _march_tangents(layout, jnp.asarray(z[place]), template, predictor)
-
-    @jax.jit
-    def pushed(z):
-        return jax.linearize(lambda y: predictor.march(layout.actuator(template, y), layout.levels(y)), z)
-
-    values, push = pushed(jnp.asarray(z[place]))
-    expected = jax.jit(jax.vmap(push))(jnp.eye(len(z[place])))
-    pairs = list(zip(jax.tree.leaves((marched, changes)), jax.tree.leaves((values, expected)), strict=True))
-    largest = max(np.abs(want).max() for _, want in pairs)  # of M: H is what M leaves of their sum
-    for got, want in pairs:
-        rounding = 1e-11 * np.abs(want).max(axis=-1, keepdims=True) + 1e-14 * largest
-        assert got.shape == want.shape and np.all(np.abs(got - want) <= rounding)
-    assert len(changes[0][0]) == layout.size > layout.density_unknowns + 6

@@ -1,0 +1,101 @@
+"""The fit's residual and Jacobian by programs that all fits share, against the whole chain."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import magjax.effects as effects
+from fitting.demo import concealed_actuator, record
+from fitting.joint import data_jacobian, data_residual, fields
+from fitting.model import whitened
+from fitting.setup import Choices, build_problem, effect_parameters, free_parameters, spectra_of
+from magjax import programs
+from magjax.bench import load_bench
+from magjax.recording import Recording
+
+SMALL = Choices(fine=128, coarse=90, knots=(16, 12), level=24, rest="negative")
+
+
+def modulated(truth, name="modulated"):
+    """Two lines far apart: a grid of its own."""
+    from magjax.simulate import simulate
+
+    t = np.arange(2000) / 2000 / 20.0
+    current = 0.1 + 0.4 * np.sin(2 * np.pi * 20 * t) + 0.2 * np.sin(2 * np.pi * 160 * t)
+    y = np.asarray(simulate(truth, current, t[1], periodic=True).displacement)
+    return Recording(t[1] * np.arange(2 * len(t)), {"current": np.tile(current, 2), "displacement": np.tile(y, 2)}, name=name)
+
+
+def problem_of(recordings, actuator=None, **choices):
+    bench = load_bench("aa-050h")
+    actuator = actuator or bench.actuator()
+    names = free_parameters(bench, actuator, effect_parameters(actuator))
+    spectra = spectra_of(recordings, bench, SMALL.harmonics)
+    return build_problem(spectra, actuator, bench, names, dataclasses.replace(SMALL, **choices))
+
+
+def some(*frequencies, noise=2):
+    rng = np.random.default_rng(noise)
+    return [record(concealed_actuator(load_bench("aa-050h")), f, 0.6, 0.0, rng, f"{f}") for f in frequencies]
+
+
+@pytest.mark.parametrize("rest", ["negative", "demagnetized"])
+def test_they_are_those_of_the_whole_chain(rest):
+    """Seven recordings on two grids, more unknowns than go through at once, effects on either side of the hysteresis."""
+    recordings = [modulated(concealed_actuator(load_bench("aa-050h"))), *some(20, 50, 90, 120, 150, 200)]
+    actuator = load_bench("aa-050h").actuator()
+    for effect in (effects.ExcessLoss(k=10.0), effects.SensorLag(tau=5e-5), effects.DeltaE(e=0.02)):
+        actuator = actuator.with_effect(effect)
+    problem, z = problem_of(recordings, actuator, rest=rest)
+    z = z + np.random.default_rng(1).uniform(0, 0.01, len(z))
+    layout, template = problem.layout, problem.template
+    assert len(z) > 114 and len(problem.predictors[0].drives) == 2
+
+    @jax.jit
+    def residual(y, predictor):
+        return whitened(predictor(layout.actuator(template, y), layout.levels(y)), problem.target)
+
+    coarse, fine = problem.predictors
+    push = jax.jit(jax.vmap(lambda d: jax.jvp(lambda y: residual(y, coarse), (jnp.asarray(z),), (d,))[1]))
+    assert data_residual(problem, z) == pytest.approx(np.asarray(residual(jnp.asarray(z), fine)), rel=1e-9, abs=1e-9)
+    found, expected = data_jacobian(problem, z), np.asarray(push(jnp.eye(len(z)))).T
+    assert found.shape == expected.shape
+    assert np.all(np.abs(found - expected) <= 1e-10 * np.abs(expected).max(axis=0) + 1e-13 * np.abs(expected).max())
+    assert np.linalg.norm(found, axis=0).min() > 0  # each of them moves something
+    for (drive, H, M), s in zip(fields(problem, z), problem.spectra, strict=True):
+        assert len(drive) == len(H) == len(M) and drive == pytest.approx(s.drive_at(np.arange(len(drive)) / len(drive)))
+
+
+@pytest.fixture
+def traced(tmp_path, monkeypatch):
+    """The names of what is traced and kept."""
+    pytest.importorskip("flatbuffers")
+    before, names = jax.config.jax_compilation_cache_dir, []
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    monkeypatch.setattr(programs, "_traced", lambda *a, made=programs._traced: names.append(a[0].__name__) or made(*a))
+    programs.forget()
+    yield names
+    jax.config.update("jax_compilation_cache_dir", before)
+    programs.forget()
+
+
+def test_another_study_asks_for_no_other_programs(traced):
+    """Other recordings, as many or more; another density on a plane of the same level; more of an effect's parameters free."""
+    actuator = load_bench("aa-050h").actuator()
+    lag, detailed = effects.SecondMode(gain=0.01, f2=900.0, xi2=0.05), effects.SecondMode(gain=0.01, f2=900.0, xi2=0.05, lead=0.1)
+    assert len(detailed.free_parameters()) > len(lag.free_parameters())
+    studies = [
+        problem_of(some(20, 200), actuator.with_effect(lag)),
+        problem_of(some(30, 70, 150), actuator.with_effect(detailed), knots=(8, 6)),
+        problem_of(some(30, 70, 110, 150, 190)),
+    ]
+    traced.clear()
+    for (problem, z), new in zip(
+        studies, (["_march", "_march_changes", "_read", "_read_changes"], [], ["_read", "_read_changes"]), strict=True
+    ):
+        data_residual(problem, z), data_jacobian(problem, z)
+        assert sorted(traced) == new  # the last: of the chain without the effect, whose march is the same
+        traced.clear()
