@@ -130,18 +130,18 @@ def _behind(classes, predictor, actuator, signals):
     return asked, jax.tree.map(lambda *x: jnp.concatenate(x), *rows)
 
 
-def _before(classes, predictor, own, path):
+def _before(classes, trials, predictor, own, path):
     """(class, shapes) of all that act before the magnetostriction, and the change of (field, magnetization, current), per grid.
 
-    `own`: the actuator with the effects that march; `path`: its trajectory."""
+    `trials`: finite amplitudes of the classes that have no derivative at null; `own`: the actuator with the effects that march;
+    `path`: its trajectory."""
     plain, asked, rows = bare(own), [], []
     still = tuple(tuple(jnp.zeros_like(part[0]) for _ in range(3)) for part in path)
     calm = tuple(jnp.zeros_like(d) for d in predictor.drives)
-    drives = [np.asarray(d) for d in predictor.drives]
     for c in classes:
         if c.shells or not (c.in_step or c.block == "source"):
             continue
-        for shapes in c.finite_trials(drives, predictor.steps) or shape_grid(c):
+        for shapes in trials[c] or shape_grid(c):
             asked.append((c, shapes))
             if c.in_step:
                 rows.append((in_step_change(c(**shapes), predictor, plain, path, c.amplitude in shapes), calm))
@@ -150,25 +150,39 @@ def _before(classes, predictor, own, path):
     return asked, through_march(predictor, own, *jax.tree.map(lambda *x: jnp.stack(x), *rows))
 
 
-def columns(problem, z):
-    """First-order change of the whitened misfit by every applicable effect: list of (class, shapes, column)."""
-    actuator = problem.layout.actuator(problem.template, jnp.asarray(z))
-    predictor, own = problem.predictors[0], marching(actuator)
-    classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
+def _changes(classes, trials, predictor, actuator):
+    """(class, shapes) of every effect, and the first-order change of the lines of the predictor's recordings, (columns, recordings,
+    harmonics + 1)."""
+    own = marching(actuator)
     fields, path = trajectory(predictor, own)
     signals = signals_of(predictor, actuator, fields)
     behind, late = _behind(classes, predictor, bare(actuator), signals)
-    before, early = _before(classes, predictor, own, path)
+    before, early = _before(classes, trials, predictor, own, path)
     changes = jax.tree.map(lambda x: jnp.concatenate([jnp.zeros((len(behind), *x.shape[1:])), x]), early)
     late = jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros((len(before), *x.shape[1:]))]), late)
     asked, lines = behind + before, [np.asarray(to_lines(predictor, actuator, fields, changes, late))]
     for c in classes:
-        for shapes in c.finite_trials([np.asarray(d) for d in predictor.drives], predictor.steps) if c.shells else ():
+        for shapes in trials[c] if c.shells else ():
             other, _ = trajectory(predictor, own.with_effect(c(**shapes)))
             lines.append((lines_of(predictor, signals_of(predictor, actuator, other)) - lines_of(predictor, signals))[None])
             asked.append((c, shapes))
+    return asked, np.concatenate(lines)
+
+
+def columns(problem, z):
+    """First-order change of the whitened misfit by every applicable effect: list of (class, shapes, column)."""
+    actuator = problem.layout.actuator(problem.template, jnp.asarray(z))
+    predictor = problem.predictors[0]
+    classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
+    drives = [np.asarray(d) for d in predictor.drives]
+    trials, lines, order = {c: c.finite_trials(drives, predictor.steps) for c in classes}, [], []
+    for part, places in predictor.batches():
+        asked, found = _changes(classes, trials, part, actuator)
+        lines.append(found[:, : len(places)])
+        order.append(places)
+    lines = np.concatenate(lines, axis=1)[:, np.argsort(np.concatenate(order))]
     zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
-    whole = np.asarray(jax.vmap(whitened, (0, None))(np.concatenate(lines), zero))
+    whole = np.asarray(jax.vmap(whitened, (0, None))(lines, zero))
     return [(c, s, column) for (c, s), column in zip(asked, whole, strict=True)]
 
 

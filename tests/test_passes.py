@@ -11,6 +11,7 @@ import magjax.effects as effects
 from fitting.demo import concealed_actuator, record
 from fitting.joint import data_jacobian, data_residual, fields
 from fitting.model import whitened
+from fitting.screen import columns
 from fitting.setup import Choices, build_problem, effect_parameters, free_parameters, spectra_of
 from magjax import programs
 from magjax.bench import load_bench
@@ -99,3 +100,17 @@ def test_another_study_asks_for_no_other_programs(traced):
         data_residual(problem, z), data_jacobian(problem, z)
         assert sorted(traced) == new  # the last: of the chain without the effect, whose march is the same
         traced.clear()
+
+
+def test_nor_does_its_screening(traced, monkeypatch):
+    """Of an effect before the hysteresis, one in the source, one behind it."""
+    kinds = [effects.SecondEddyPath, effects.AmplifierLag, effects.StrainHysteresis]
+    monkeypatch.setattr("fitting.screen.applicable", lambda actuator, quasistatic: kinds)
+    few, more = problem_of(some(20, 200)), problem_of(some(30, 70, 150), knots=(8, 6))
+    traced.clear()
+    found = columns(*few)
+    assert {"trajectory", "through_march", "late_change", "to_lines"} <= set(traced) and len(found) >= len(kinds)
+    traced.clear()
+    again = columns(*more)
+    assert traced == [] and [row[:2] for row in again] == [row[:2] for row in found]
+    assert len(again[0][2]) > len(found[0][2])
