@@ -4,10 +4,9 @@ Noise (between the harmonics), solver (the residual on a finer grid), density (f
 data themselves: drift, an unsettled start, periods that do not repeat.
 """
 
-import jax.numpy as jnp
 import numpy as np
 
-from .model import Predictor, predicted_lines
+from .model import Predictor
 from .record_level import drift_of
 from .spectra import fit_lines
 
@@ -22,9 +21,8 @@ def solver_floor(problem, solution) -> float:
     """Rms change of the reading when the step is halved, unit of the reading."""
     fine = problem.predictors[1]
     grids = [d.shape[1] for d in fine.drives]
-    actuator = problem.layout.actuator(problem.template, jnp.asarray(solution.z))
     twice = Predictor.build(problem.spectra, 2 * min(grids), fine.harmonics, fine.periods, fine.corners)
-    change = np.asarray(predicted_lines(twice, actuator) - predicted_lines(fine, actuator))[:, 1:]
+    change = (problem.passes.lines(solution.z, twice) - problem.passes.lines(solution.z, fine))[:, 1:]
     return float(np.sqrt(np.mean(2 * np.sum(np.abs(change) ** 2, axis=1))))
 
 

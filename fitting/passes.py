@@ -96,13 +96,17 @@ class Passes:
 
     def residual(self, z) -> np.ndarray:
         """The whitened misfit on the fine grid."""
-        z, predictor = np.asarray(z, float), self.problem.predictors[1]
+        return whitened(self.lines(z, self.problem.predictors[1]), self.target, np)
+
+    def lines(self, z, predictor) -> np.ndarray:
+        """The reading's coefficients by a predictor of the same recordings, (recordings, harmonics + 1)."""
+        z = np.asarray(z, float)
         parameters = self.read.at(z)
-        lines = np.concatenate([
+        lines = [
             np.asarray(_read(self.read.actuator, self.read.names, parameters, part, marched))[: len(places)]
             for part, places, marched in self._marched(z, predictor)
-        ])  # fmt: skip
-        return whitened(lines[self.order], self.target, np)
+        ]
+        return np.concatenate(lines)[self.order]
 
     def fields(self, z) -> list:
         """Drive, field H and magnetization M of every recording over a period of the fine grid: [(drive, H, M)], (samples,)."""
