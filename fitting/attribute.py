@@ -208,7 +208,7 @@ def _physical(effect, result) -> bool:
 def _readings(spectra) -> tuple[float, float]:
     """The lowest and the highest reading."""
     ends = [float(s.reading[0].real) + side * s.peak_to_peak / 2 for s in spectra for side in (-1, 1)]
-    return min(ends), max(ends)
+    return min(ends, default=0.0), max(ends, default=0.0)
 
 
 def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:

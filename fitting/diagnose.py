@@ -9,6 +9,7 @@ import dataclasses
 import numpy as np
 
 from magjax.bench import load_bench
+from magjax.effects import CLASSES
 
 from .alternation import alternating
 from .attribute import (
@@ -91,7 +92,14 @@ def diagnose(
     if known := known_instruments(recordings, calibration, bench):
         return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
     task = Task(tuple(recordings), bench, choices, progress, actuator)
-    return _with_missed_check(task, _diagnosed(task, check), check)
+    return _with_asked(_with_missed_check(task, _diagnosed(task, check), check), choices.only)
+
+
+def _with_asked(found, only) -> Diagnosis:
+    """The diagnosis with the effects that alone were asked for, and a word on those that say nothing on this bench."""
+    idle = [n for n in only if found.candidates and n not in {c.name for c in found.candidates} and not CLASSES[n].record_level]
+    found = dataclasses.replace(found, asked=only)
+    return found.noted(f"{' and '.join(idle)} cannot be asked for on this bench.") if idle else found
 
 
 def _diagnosed(task, check) -> Diagnosis:
@@ -207,7 +215,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
         return _examined(before_zeros[0], measured, before_zeros[1], check, zeros=False)
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
-        _absorbed(candidates, reached.tried),
+        _absorbed(candidates, reached.tried), task.choices.only,
     )  # fmt: skip
     return _with_zero(_concluded(task, evidence), zero, rival)
 

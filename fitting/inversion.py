@@ -6,11 +6,13 @@ from .uncertainty import WIDEN, covariance
 
 
 def mass_errors(result) -> np.ndarray:
-    """Standard errors of the masses of a `FitResult`, A/m, in the shape of `actuator.hysteresis.masses`.
+    """Standard errors of the masses of a `FitResult`, A/m, in the shape of `actuator.hysteresis.masses`; none where they are held.
 
     The masses are total * (cells @ x) of the hats' heights x, so their covariance is that of x carried through.
     """
     layout = result.problem.layout
+    if layout.held is not None:
+        return np.zeros(layout.held.shape)
     n = layout.density_unknowns
     hats = covariance(result.solution.normal, result.solution.z, layout)[:n, :n]
     cells = np.concatenate(layout.cells)[:n].reshape(n, -1).T

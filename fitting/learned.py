@@ -22,6 +22,7 @@ from .nonparametric import ONE, Place, locate_places
 from .setup import build_problem
 from .together import let_go
 from .uncertainty import WIDEN, covariance
+from .verdict import asked_for
 
 TRIED = 4  # leaders that are fitted jointly
 NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
@@ -324,7 +325,7 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None, l
     unknown = {**(found.unknown or {}), "block": place.block, "region": where, **more}
     nearest = f"{learned.share:.0%} of the excess"
     text = (
-        f"something is missing that no effect of the catalogue explains. It acts like a function of {place.joined(words)} "
+        f"something is missing that no effect {asked_for(base.choices.only)} explains. It acts like a function of {place.joined(words)} "
         f"at the {place.block} ({where}): learned as one, it takes {nearest} (chi2/N {base.chi2_per_sample:.3g} -> {learned.result.chi2_per_sample:.3g}; "
         f"recordings left out {learned.left_out[0]:.3g} -> {learned.left_out[1]:.3g})."
     )

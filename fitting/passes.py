@@ -17,11 +17,6 @@ from .density import COLUMNS
 from .model import MEMORY, Target, whitened
 from .solver import pushed
 
-ROWS, MOST_ROWS = (
-    5,
-    15,
-)  # recordings go through in whole ROWS, the last repeated where there are fewer, and in parts where there are more
-
 
 class Point(eqx.Module):
     """Where a program is to stand, or a direction there (a leading axis of columns on each).

@@ -34,7 +34,10 @@ def without_chance(evidence) -> Evidence:
 
 
 def _tells_nothing(evidence) -> bool:
-    """Whether no effect that a density cannot pass for scores beyond what a rough one leaves, or all next to nothing of the misfit."""
+    """Whether no effect that a density cannot pass for scores beyond what a rough one leaves, or all next to nothing of the misfit;
+    not known where few are asked for."""
+    if evidence.only:
+        return False
     highest = max((c.z**2 for c in evidence.candidates if c.name not in LIKE_DENSITY), default=0.0)
     return highest < max(SECOND_Z**2, NOTHING_OF_IT * excess_of(evidence.plain))
 

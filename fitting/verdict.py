@@ -67,6 +67,7 @@ class Diagnosis:
     base: object = None
     repaired: object = None
     placebo: dict | None = None
+    asked: tuple = ()  # the effects that alone were asked for, where these were named
 
     def __str__(self):
         return f"{self.verdict}: {self._said()}"
@@ -108,7 +109,7 @@ class Diagnosis:
             "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
             "placebo": self.placebo, "message": self._said(), "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
-        } | ({"check_left_out": list(self.check_left_out)} if self.check_left_out else {})  # fmt: skip
+        } | {n: list(v) for n, v in (("check_left_out", self.check_left_out), ("asked", self.asked)) if v}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +119,7 @@ class Evidence:
     `reached`: what the search has (`search.Reached`); `adopted`: record-level effects, each with its rivals; `raw`: the plain
     fit of the readings as they came, `plain`: that of the readings without record-level signals (the same where there are
     none); `candidates`: the scores beside `plain`; `checks`: the check recordings as they came, and without those signals;
-    `floors`, `where`, `absorbed`: as in `Diagnosis`.
+    `floors`, `where`, `absorbed`: as in `Diagnosis`; `only`: the effects that alone are asked for, where these are named.
     """
 
     reached: object
@@ -132,6 +133,7 @@ class Evidence:
     floors: dict
     where: dict
     absorbed: tuple
+    only: tuple = ()
 
     @property
     def excess(self) -> float:
@@ -285,14 +287,18 @@ def unconfirmed(reached):
     return dataclasses.replace(reached, steps=steps)
 
 
+def asked_for(only) -> str:
+    """Of which effects a verdict speaks, in words."""
+    return f"asked for ({', '.join(only)})" if only else "of the catalogue"
+
+
 def _silent(evidence, common, dropped, rough) -> Diagnosis:
-    asked = {c.name for c in evidence.candidates}
-    if asked and asked <= set(evidence.absorbed):  # of the whole catalogue some would always show
-        seen = ", ".join(f"{c.name} ({c.visibility:.2g} of it)" for c in evidence.candidates)
-        text = f"these recordings cannot tell whether it is there, for the density does the same but for a little: {seen}."
-        text += f" The fit stands at chi2/N = {evidence.excess:.2f} without it; another channel has to show it, the flux in a pick-up coil for one."
+    only, asked = evidence.only, [c.name for c in evidence.candidates]
+    if only and asked and set(asked) <= set(evidence.absorbed):
+        text = f"these recordings cannot tell whether {' or '.join(asked)} is there: a density that differs by a little does the same. "
+        text += f"The fit stands at chi2/N = {evidence.excess:.2f} without it; another channel has to show it, the flux in a pick-up coil for one."
         return Diagnosis("absorbed", text, **common)
-    text = f"no effect of the catalogue was found: chi2/N = {evidence.excess:.2f} and "
+    text = f"no effect {asked_for(only)} was found: chi2/N = {evidence.excess:.2f} and "
     if dropped:
         text += f"{dropped}, which serves best, takes less than half of what is above the noise."
     else:
@@ -367,7 +373,8 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
     region = f"{evidence.bench.terms.field} quarter {int(np.argmax(fields)) + 1} of 4" if fields else ""
     steps = evidence.reached.steps
     best = steps[0][0].name if steps else (common["candidates"][0].name if common["candidates"] else "none")
-    nothing = "that no effect of the catalogue both explains and foretells" if note else "that no effect of the catalogue explains"
+    which = asked_for(evidence.only)
+    nothing = f"that no effect {which} both explains and foretells" if note else f"that no effect {which} explains"
     text = (
         f"something is missing {nothing} (chi2/N = {evidence.excess:.3g} at best; {best} comes nearest and explains "
         f"{max(evidence.share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."

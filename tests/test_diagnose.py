@@ -24,7 +24,7 @@ from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
 from fitting.spectra import line_deviations
 from fitting.task import Task
-from fitting.verdict import Evidence
+from fitting.verdict import Diagnosis, Evidence
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording
@@ -74,7 +74,17 @@ def test_effects_that_are_asked_for_alone(bench, asked, said):
     found = diagnose(runs, bench, choices=Choices(fine=250, only=asked))
     assert found.verdict == said and {c.name for c in found.candidates} <= set(asked)
     assert set(found.absorbed) == set(asked) & {"mean_field", "linear_strain"}
-    assert said != "absorbed" or ("mean_field" in found.message and "pick-up coil" in found.message)
+    assert said != "absorbed" or ("mean_field or linear_strain is there" in found.message and "pick-up coil" in found.message)
+    assert found.as_dict()["asked"] == list(asked) and "of the catalogue" not in found.message
+
+
+def test_what_says_nothing_on_a_bench_is_told(bench):
+    from fitting.diagnose import _with_asked
+
+    found = Diagnosis("nothing_missing", "All is well.", candidates=(scored("sensor_lag", 1.0),))
+    assert _with_asked(found, ()).message == "All is well."
+    told = _with_asked(found, ("sensor_lag", "eddy_currents", "mains_hum"))
+    assert told.message == "All is well. eddy_currents cannot be asked for on this bench." and told.asked[1] == "eddy_currents"
 
 
 @pytest.mark.long

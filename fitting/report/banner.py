@@ -64,10 +64,10 @@ def headline(found) -> str:
         found_beside = f"; found beside it: {beside}" if beside else ""
         return f"Something is missing, and these recordings cannot say which: {names}{found_beside}"
     if verdict == "nothing_missing" and (left := still_left(found)):
-        return f"No effect of the catalogue was found{_judged(found)}; {left}"
+        return f"No effect {_asked(found)} was found{_judged(found)}; {left}"
     if verdict == "unknown_at":
         where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
-        return f"Something is missing that no effect of the catalogue explains; it acts most like the block {where}"
+        return f"Something is missing that no effect {_asked(found)} explains; it acts most like the block {where}"
     return {
         "nothing_missing": "Nothing is missing: the model meets the recordings to their noise",
         "absorbed": "What may be missing cannot show in these recordings: the density absorbs it",
@@ -83,6 +83,11 @@ def _at_fault(found) -> str:
     if bench and (files or "leave it out" in text):
         return "The recordings or the bench file"
     return "The bench file" if bench else " and ".join(files) or "The recordings"
+
+
+def _asked(found) -> str:
+    """Of which effects the diagnosis speaks."""
+    return "asked for" if found.get("asked") else "of the catalogue"
 
 
 def _judged(found) -> str:

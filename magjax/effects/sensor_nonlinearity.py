@@ -37,15 +37,16 @@ class SensorNonlinearity(AbstractEffect):
     def extent(self, readings, actuator) -> float:
         """Largest departure relative to the largest motion, over the motion that makes the readings: a polynomial may run far
         outside it."""
-        largest = max(np.max(np.abs(readings)), 1e-300)
-        departures, motions = [], []
+        largest, departures, motions = max(np.max(np.abs(readings)), 1e-300), [0.0], [1e-3 * np.ptp(readings)]
         for side in (-1.0, 1.0):
             y = side * largest * np.linspace(0, 2, 401)
             read = np.asarray(self.reading(y, None, None, actuator))
-            seen = np.cumprod((y == 0) | (read >= readings[0]) & (read <= readings[1]) & (side * (read - read[0]) >= 0))
-            departures.append(np.max(seen * np.abs(read - y)))
-            motions.append(np.max(seen * np.abs(y)))
-        return float(max(departures) / max(*motions, 1e-3 * largest))
+            low, high = min(readings[0], read[0]), max(readings[1], read[0])
+            led = np.cumprod((read >= low) & (read <= high) & (side * (read - read[0]) >= 0)).astype(bool)
+            seen = led & (read >= readings[0]) & (read <= readings[1])
+            departures.extend(np.abs(read - y)[seen])
+            motions.extend(np.abs(y)[seen])
+        return float(max(departures) / max(motions))
 
     def reading(self, reading, signals, line, actuator):
         """Reading through the curve."""
