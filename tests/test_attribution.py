@@ -173,6 +173,7 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     best = trial("sensor_lag", 1.0)
     best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
+    before = SimpleNamespace(chi2_per_sample=50.0, data_count=COUNT)
     again, spoiled = [], []
 
     def fit(*a, choices, start, **k):
@@ -188,14 +189,30 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     task = Task((), load_bench("aa-050h"), Choices(rest=held))
     assert task.bench.start == "auto"
     far = trial("creep", 2.0)
-    _, kept, asked = module._finer(task, None, best, [best, far], 1.0)
+    _, kept, asked = module._finer(task, before, best, [best, far], 1.0)
     assert asked.choices.rest == (found if taken else held) and again == ([found] if taken else [])
     assert names(kept) == ["sensor_lag", "creep"]  # it may serve beside a later effect
-    *_, fixed = module._finer(task, None, best, [best], 1.0, any_rest=False)
+    *_, fixed = module._finer(task, before, best, [best], 1.0, any_rest=False)
     assert fixed.choices.rest == held
     spoiled.append(True)  # what ends far off from there is not taken
-    kept, _, back = module._finer(task, None, best, [best], 1.0)
+    kept, _, back = module._finer(task, before, best, [best], 1.0)
     assert kept is best and back.choices.rest == held
+
+
+@pytest.mark.parametrize(
+    ("before", "left", "asked"),
+    [(6760.0, 204.0, 338.0), (1000.0, 204.0, None), (100.0, 20.0, 30.0)],
+    ids=["little of it", "much of it", "not far"],
+)
+def test_a_finer_density_is_tried_beside_what_takes_nearly_all(monkeypatch, before, left, asked):
+    """A sensor's curve beside an excess_loss on blocks: 6760 to 204, and 9.7 with finer hats, where the loss shows."""
+    best, limits = trial("sensor_nonlinearity", left, base=before), []
+    best.result.actuator, best.result.spectra = SimpleNamespace(effects=()), None
+    found = SimpleNamespace(choices=Choices(rest="negative"))
+    monkeypatch.setattr("fitting.task.Task.fit", lambda *a, refine, **k: limits.append(refine) or found)
+    task = Task((), SimpleNamespace(start="negative"), Choices(rest="negative"))
+    fitting.search._finer(task, SimpleNamespace(chi2_per_sample=before), best, [best], 1.0, any_rest=False)
+    assert limits == ([] if asked is None else [pytest.approx(asked)])
 
 
 @pytest.mark.parametrize(
