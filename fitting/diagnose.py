@@ -13,53 +13,36 @@ from magjax.effects import CLASSES
 
 from .alternation import alternating
 from .attribute import (
-    BIC_DROP,
-    CLOSE,
     LIKE_DENSITY,
     MIN_DROP,
     MISFIT,
-    SETTLED_CHI2,
-    TIE,
-    WEAK_TIE,
     chi2_of,
-    excess_of,
-    settled,
-    try_effect,
 )
 from .check import check_errors
-from .fit import FINER_FROM, REFINE_BELOW, finer_than
+from .fit import REFINE_BELOW, finer_than
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import better_learned, with_learned_term
 from .locate import where
-from .on_lines import hum_score, offset_score, zeros_score
+from .own_signals import hum_on_harmonics, needless_zeros, own_zeros, record_level, sensor_zero, unsettled_means, with_zero
 from .reach import BEYOND
-from .record_level import hum_is_seen, hum_of, record_effects, remove_from_checks, remove_record_effect, zeros_of
+from .record_level import remove_from_checks
 from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance
-from .rows import DRIFTS
 from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
 from .verdict import (
-    SILENT_CHI2,
     WORSE,
     Z_THRESHOLD,
     Diagnosis,
     Evidence,
     first_alone,
-    least_excess,
     misfit,
     unexplained,
     verdict,
 )
 
-RECORD_Z = 8.0
-FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
-MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
-NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
-MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the recordings must hold
-MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
 ABSORBED_VISIBILITY = 0.004
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
@@ -110,7 +93,7 @@ def _diagnosed(task, check) -> Diagnosis:
     if alternation := alternating(recordings, spectra, bench.output):
         return alternation.told(_diagnosed(task.on(recordings=tuple(alternation.cleaned)), check))
     problem = data_problem(recordings, spectra, bench.output)
-    adopted, cleaned = _record_level(recordings, spectra, bench, choices)
+    adopted, cleaned = record_level(recordings, spectra, bench, choices)
     if problem and (not adopted or data_problem(cleaned, spectra_of(cleaned, bench, choices.harmonics), bench.output)):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=task.fit(refine=False))
     found = _examined(task.on(recordings=tuple(cleaned)), task, adopted, check)
@@ -180,11 +163,11 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     if problem := wrong_bench(plain):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
     candidates = screened(plain, task.choices)
-    if found := _hum_on_harmonics(task, adopted, plain, candidates):
+    if found := hum_on_harmonics(task, adopted, plain, candidates):
         cleaned, hum, freed = found
         return _examined(cleaned, measured, [*adopted, hum], check, freed)
-    plain, candidates, zero, rival = _sensor_zero(task, plain, candidates)
-    if zeros and zero is None and (found := _own_zeros(task, adopted, plain, candidates)):
+    plain, candidates, zero, rival = sensor_zero(task, plain, candidates)
+    if zeros and zero is None and (found := own_zeros(task, adopted, plain, candidates)):
         cleaned, own, freed = found
         return _examined(cleaned, measured, [*adopted, own], check, freed, (task, adopted))
     free = task.held if zero is None else (*task.held, "sensor.offset")
@@ -195,7 +178,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     anew = []  # what the diagnosis begins anew with: recordings without what showed beside an effect, or a better plain fit
 
     def begins_anew(current) -> bool:
-        if found := _hum_on_harmonics(task, adopted, current):
+        if found := hum_on_harmonics(task, adopted, current):
             cleaned, hum, _ = found
             anew.append({"task": cleaned, "adopted": [*adopted, hum]})
         elif zero is None and (better := _better_valley(task, plain, candidates, current)):
@@ -203,7 +186,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
         return bool(anew)
 
     def free_means(fit, best) -> bool:
-        if zeros and zero is None and (found := _unsettled_means(task, adopted, fit, best)):
+        if zeros and zero is None and (found := unsettled_means(task, adopted, fit, best)):
             cleaned, own = found
             anew.append({"task": cleaned, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
         return bool(anew)
@@ -211,13 +194,13 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     reached = search(task, plain, candidates, checks[1], begins_anew, free_means)
     if anew:
         return _examined(measured=measured, check=check, zeros=zeros, **anew[-1])
-    if before_zeros and _needless_zeros(before_zeros[0], reached):
+    if before_zeros and needless_zeros(before_zeros[0], reached):
         return _examined(before_zeros[0], measured, before_zeros[1], check, zeros=False)
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried), task.choices.only,
     )  # fmt: skip
-    return _with_zero(_concluded(task, evidence), zero, rival)
+    return with_zero(_concluded(task, evidence), zero, rival)
 
 
 def _concluded(task, evidence) -> Diagnosis:
@@ -260,40 +243,10 @@ def _wrong_name(task, evidence, found):
     return None if after > WORSE[0] * before + WORSE[1] * len(rows) else learned
 
 
-def _with_zero(found, zero, rival) -> Diagnosis:
-    """The diagnosis with a word on the sensor's zero: adopted, or told of beside an effect that does as well."""
-    if zero is not None:
-        note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
-    elif rival is not None and (found.effects or found.groups):
-        note = f" A sensor's zero {rival:.3g} m away from the rod's rest would explain as much; if it was not set there, free sensor.offset in the bench file."
-    else:
-        return found
-    return dataclasses.replace(found, message=found.message + note)
-
-
 def _absorbed(candidates, tried) -> tuple[str, ...]:
     """What these recordings could not show: the density makes nearly all of it. What scores or was fitted did show."""
     silent = [c for c in candidates if abs(c.z) < Z_THRESHOLD and c.name not in tried]
     return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY)
-
-
-def _hum_on_harmonics(task, adopted, base, candidates=()):
-    """Hum that falls on harmonics of the drive, where no repeat shows it: adopted if it scores above every effect and takes
-    most of what `base` leaves. Returns the task without it, the effect with its rivals, and its fit; None elsewhere.
-    """
-    held, bench = any(e.name == "mains_hum" for e, _ in adopted), task.bench
-    if held or bench.output != "displacement" or _quasistatic(bench) or not base.chi2_per_sample > SILENT_CHI2:
-        return None
-    excess = excess_of(base)
-    z, tones = hum_score(base.problem, base.refined)
-    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 for c in candidates)]) or not hum_is_seen(base.spectra, tones):
-        return None
-    effect = hum_of(base.spectra, z, tones)
-    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
-    freed = cleaned.fit(base.actuator)
-    if chi2_of(freed) > chi2_of(base) - MOST_OF_IT * excess:
-        return None
-    return cleaned, (effect, []), freed
 
 
 def _better_valley(task, plain, candidates, current):
@@ -312,101 +265,6 @@ def _better_valley(task, plain, candidates, current):
     return better if chi2_of(better) < chi2_of(plain) - max(MIN_DROP, VALLEY * drop) else None
 
 
-def _own_zeros(task, adopted, base, candidates):
-    """A zero that changes from recording to recording: adopted if it promises about as much as any effect, alone meets the
-    noise, and the effects that promise as much do not serve as well. Beside a drift within the recordings, which goes on between
-    them, it need only take nearly all. Returns the task with free means, the effect with its rivals, and its fit; None elsewhere.
-    """
-    held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
-    if held or bench.output != "displacement" or _quasistatic(bench) or not base.chi2_per_sample > least_excess(base):
-        return None
-    excess = excess_of(base)
-    z, zeros, errors = zeros_score(base.problem, base.refined)
-    likely = [c for c in candidates if abs(c.z) > CLOSE * z]
-    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 * (1 - WEAK_TIE[0]) - TIE for c in candidates)]):
-        return None
-    effect, *rivals = zeros_of(base.spectra, z, zeros, errors, [e.name for e, _ in adopted])
-    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
-    freed = cleaned.fit(base.actuator)
-    drifts = any(e.name in DRIFTS for e, _ in adopted)
-    met = freed.chi2_per_sample < least_excess(freed) or (drifts and chi2_of(freed) < chi2_of(base) - NEARLY_ALL * excess)
-    if not met or chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
-        return None
-    cost = chi2_of(freed) + len(zeros) * np.log(freed.data_count)
-    if freed.choices != base.choices:  # on the same density: a rough one would speak against them
-        task = task.on(choices=freed.choices)
-        base = task.fit_on(freed, base.actuator, spectra=base.spectra)
-        excess = excess_of(base)
-    trials = (settled(task, base, try_effect(task, base, c, excess), excess) for c in likely[:MOST_LIKELY])
-    if any(t.physical and chi2_of(t.result) + t.parameters * np.log(freed.data_count) < cost for t in trials):
-        return None
-    return cleaned, (effect, rivals), freed
-
-
-def _unsettled_means(task, adopted, slow, best):
-    """Means that an effect has brought as far in each recording as the drive had run before: set free where they hold most of
-    what the fit with this `slow` effect leaves, and so serve better than the `best` of all. Returns the task with free means
-    and the effect with its rivals; None elsewhere.
-
-    Its law has one such number for all recordings; with the others wrong, another slow effect that bends the means serves better.
-    """
-    held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
-    if held or bench.output != "displacement" or _quasistatic(bench) or not best.chi2_per_sample > MISFIT:
-        return None
-    excess = excess_of(slow)
-    z, zeros, errors = zeros_score(slow.problem, slow.refined)
-    cost = len(zeros) * np.log(best.data_count) + BIC_DROP
-    if z**2 < MEANS_HOLD * excess or chi2_of(slow) - z**2 + cost > chi2_of(best):
-        return None
-    task.say("with means of their own", slow.chi2_per_sample)
-    effect, *rivals = zeros_of(slow.spectra, z, zeros, errors, [e.name for e, _ in adopted])
-    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
-    freed = cleaned.fit(slow.actuator, start=slow, choices=slow.choices, refine=False)
-    met = chi2_of(freed) < min(chi2_of(slow) - MEANS_HOLD * excess, chi2_of(best) - cost)
-    return (cleaned, (effect, rivals)) if met else None
-
-
-def _needless_zeros(task, reached) -> bool:
-    """Whether the recordings with their means are met by the effects that were found beside zeros of their own, nearly as well.
-
-    `task`: before the means were set free."""
-    if not reached.steps:
-        return False
-    current = reached.current
-    task.say("with the means again", current.chi2_per_sample)
-    again = task.fit(current.actuator, start=current, choices=current.choices, refine=False)
-    cost = 2 * len(task.recordings) * np.log(again.data_count)
-    return again.chi2_per_sample < SETTLED_CHI2 and chi2_of(again) < chi2_of(current) + cost
-
-
-def _sensor_zero(task, base, candidates):
-    """A sensor whose zero is not the rod's rest: part of the base, if it scores above any effect and alone meets the noise.
-
-    Returns the base, its candidates, the zero, m, or None, and the zero that would explain as much as the best effect, or None.
-    """
-    as_it_is, bench = (base, candidates, None, None), task.bench
-    if bench.output != "displacement" or bench.drive == "voltage" or "sensor.offset" in bench.free:
-        return as_it_is
-    best, excess = max((c.z**2 for c in candidates), default=0.0), excess_of(base)
-    score = offset_score(base.problem, base.refined) ** 2
-    tied = max(TIE, WEAK_TIE[0] * best)
-    needed = min(best - tied, 0.5 * excess) if base.chi2_per_sample > FAR_ZERO else best - tied
-    if score < max(Z_THRESHOLD**2, needed):
-        return as_it_is
-    free = (*task.held, "sensor.offset")
-    freed = task.fit_on(base, extra=free, choices=base.choices)
-    if chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
-        return as_it_is
-    if freed.chi2_per_sample > FINER_FROM[0]:  # the density was chosen under the misfit
-        freed = task.fit(extra=free, spectra=base.spectra)
-    if freed.chi2_per_sample > SILENT_CHI2:
-        return as_it_is
-    zero = freed.estimate("sensor.offset").value
-    if score < best + tied and base.chi2_per_sample < FAR_ZERO:
-        return base, candidates, None, zero
-    return freed, screened(freed, task.choices), zero, None
-
-
 def _screened_finer(task, base, candidates, free):
     """The base and its candidates; where none would take half of what is left, a finer density is given a chance first."""
     above = chi2_of(base) - base.data_count
@@ -421,26 +279,6 @@ def _screened_finer(task, base, candidates, free):
             return base, candidates
     finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=UNEXPLAINED)
     return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, task.choices))
-
-
-def _quasistatic(bench) -> bool:
-    return bool(bench.columns.get("time", {}).get("quasistatic"))
-
-
-def _record_level(recordings, spectra, bench, choices):
-    """Drift, heat and hum, scored between the harmonics: (adopted with their rivals, the recordings without them)."""
-    adopted = []
-    for _ in range(0 if _quasistatic(bench) or bench.output != "displacement" else 2):
-        known = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
-        found = [e for e in record_effects(recordings, spectra) if e.name not in known]
-        best = found[0]
-        if abs(best.z) < RECORD_Z:
-            break
-        rivals = [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z)]
-        adopted.append((best, rivals))
-        recordings = remove_record_effect(recordings, best, bench.output)
-        spectra = spectra_of(recordings, bench, choices.harmonics)
-    return adopted, recordings
 
 
 def _floors(result) -> dict:

@@ -107,7 +107,7 @@ def menu(spectra, bench) -> list[tuple[float, float, float]]:
     low, high = max(low, -limit), min(high, limit)
     seen = np.array([s.frequency for s in spectra])
     frequencies = {0.5 * seen.min(), np.sqrt(seen.min() * seen.max()), seen.max(), 1.5 * seen.max(), 2 * seen.max()}
-    if bench.columns.get("time", {}).get("quasistatic"):
+    if bench.quasistatic:
         frequencies = {seen[0]}
     return [(f, share * 0.5 * (high - low), 0.5 * (high + low)) for f in sorted(frequencies) for share in (0.98, 0.5)]
 

@@ -97,6 +97,14 @@ class Layout(eqx.Module):
         k = self.names.index(name)
         return float(self.value(name, z)) if self.log[k] else float(self.scales[k])
 
+    def parameters(self, z) -> tuple[np.ndarray, np.ndarray]:
+        """All of them in SI, and d value / d z of each, in NumPy."""
+        starts, scales, log = np.asarray(self.starts), np.asarray(self.scales), np.asarray(self.log, bool)
+        n = self.density_unknowns + 1
+        y = np.asarray(z)[n : n + len(starts)]
+        values = np.where(log, starts * np.exp(np.where(log, y, 0.0)), starts + scales * y)
+        return values, np.where(log, values, scales)
+
     def coordinate(self, name: str, value: float) -> float:
         """The optimiser's coordinate of a value in SI."""
         k = self.names.index(name)

@@ -87,7 +87,7 @@ class Passes:
         self.held = None if layout.held is None else float(np.sum(layout.held))
         self.none = (None, None) if self.held is not None else tuple(np.zeros(x[0].shape) for x in (layout.cells, layout.tables))
         self.target = Target(*(np.asarray(getattr(problem.target, f.name)) for f in dataclasses.fields(Target)))
-        self.order = np.argsort(np.concatenate([places for _, places in problem.predictors[0].batches()]))
+        self.order = np.asarray(problem.predictors[0].index)
 
     def residual(self, z) -> np.ndarray:
         """The whitened misfit on the fine grid."""
@@ -189,23 +189,21 @@ class _Template:
     """An actuator and the parameters of it that a program is given, SI: of all effects, free or not, and what else is free."""
 
     def __init__(self, actuator, names, layout):
-        self.actuator, self.names, known = actuator, names, actuator.parameters()
+        self.actuator, self.names, self.layout, known = actuator, names, layout, actuator.parameters()
         self.values = np.asarray([float(known[n][0]) for n in names])
-        pairs = [(names.index(n), k) for k, n in enumerate(layout.names) if n in names]
-        self.to, self.free = (np.asarray([p[i] for p in pairs], int) for i in (0, 1))
-        self.place = layout.density_unknowns + 1 + self.free
-        self.starts, self.scales = (np.asarray(x)[self.free] for x in (layout.starts, layout.scales))
-        self.log = np.asarray(layout.log, bool)[self.free]
+        self.free = np.asarray([k for k, n in enumerate(layout.names) if n in names], int)  # among those of the layout,
+        self.to = np.asarray([names.index(layout.names[k]) for k in self.free], int)  # and where they stand here
 
     def at(self, z) -> np.ndarray:
         """Their values."""
-        values, z = self.values.copy(), z[self.place]
-        values[self.to] = np.where(self.log, self.starts * np.exp(np.where(self.log, z, 0.0)), self.starts + self.scales * z)
+        values = self.values.copy()
+        values[self.to] = self.layout.parameters(z)[0][self.free]
         return values
 
     def slopes(self, z, columns) -> np.ndarray:
         """Their derivatives by the unknowns `columns`, (COLUMNS, parameters)."""
         found = np.zeros((COLUMNS, len(self.names)))
-        here = np.flatnonzero((self.place >= columns[0]) & (self.place <= columns[-1]))
-        found[self.place[here] - columns[0], self.to[here]] = np.where(self.log, self.at(z)[self.to], self.scales)[here]
+        rows = self.layout.density_unknowns + 1 + self.free - columns[0]
+        here = (rows >= 0) & (rows < len(columns))
+        found[rows[here], self.to[here]] = self.layout.parameters(z)[1][self.free][here]
         return found

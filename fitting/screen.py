@@ -175,12 +175,11 @@ def columns(problem, z):
     predictor = problem.predictors[0]
     classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
     drives = [np.asarray(d) for d in predictor.drives]
-    trials, lines, order = {c: c.finite_trials(drives, predictor.steps) for c in classes}, [], []
+    trials, lines = {c: c.finite_trials(drives, predictor.steps) for c in classes}, []
     for part, places in predictor.batches():
         asked, found = _changes(classes, trials, part, actuator)
         lines.append(found[:, : len(places)])
-        order.append(places)
-    lines = np.concatenate(lines, axis=1)[:, np.argsort(np.concatenate(order))]
+    lines = np.concatenate(lines, axis=1)[:, np.asarray(predictor.index)]
     zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
     whole = np.asarray(jax.vmap(whitened, (0, None))(lines, zero))
     return [(c, s, column) for (c, s), column in zip(asked, whole, strict=True)]

@@ -175,7 +175,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     template = actuator if held else make_start_actuator(actuator, basis, rest)
     if isinstance(bench.start, tuple) and not held:
         template = template.remembering(bench.start)
-    problem = Problem(layout, template, predictors, target, tuple(spectra), _quasistatic(bench))
+    problem = Problem(layout, template, predictors, target, tuple(spectra), bench.quasistatic)
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
 
 
@@ -214,10 +214,6 @@ def _bounds(names, values, infos, log, bench):
             about = about if given_nearby else value
             lows[k], highs[k] = about / REACH, about * REACH
     return lows, highs
-
-
-def _quasistatic(bench) -> bool:
-    return bool(bench.columns.get("time", {}).get("quasistatic"))
 
 
 def _prior(bench, name, value, is_log, info):

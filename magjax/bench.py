@@ -100,6 +100,11 @@ class Bench:
         return terms_of(self.drive)
 
     @property
+    def quasistatic(self) -> bool:
+        """Whether its loops are given as points, with no time."""
+        return bool(self.columns.get("time", {}).get("quasistatic"))
+
+    @property
     def limit(self) -> float | None:
         """Largest drive that [limits] states, SI."""
         return self.limits.get(LIMITS[self.drive])

@@ -139,7 +139,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
     if len({len(v) for v in columns.values()}) > 1:
         lengths = ", ".join(f"{q} {len(v)}" for q, v in columns.items())
         raise RecordingError(f"{path}: columns of unequal length ({lengths}); save as many samples of each")
-    if not bench.columns.get("time", {}).get("quasistatic") and "time" not in columns:
+    if not bench.quasistatic and "time" not in columns:
         raise RecordingError(f"{path}: no time column among {', '.join(available)}; name one time_s or map it in [columns.time]")
     if split is not None:
         if split not in table:
@@ -153,7 +153,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         parts = [(f"{path.name}[{split}={label:g}]", table[split] == label) for label in labels]
     else:
         parts = [(path.name, np.ones(len(columns[bench.drive]), bool))]
-    if not bench.columns.get("time", {}).get("quasistatic"):
+    if not bench.quasistatic:
         for name, rows in parts:
             _refuse_clipping(name, {q: v[rows] for q, v in columns.items()}, bench)
     if bench.columns.get("time", {}).get("merge"):
@@ -166,7 +166,7 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
 
 def _refuse_missing(path, table, bench):
     """Where several columns are missing, one line names them all (of a single one, `quantity_of` tells how to name it)."""
-    wanted = (*(() if bench.columns.get("time", {}).get("quasistatic") else ("time",)), bench.drive, bench.output)
+    wanted = (*(() if bench.quasistatic else ("time",)), bench.drive, bench.output)
     missing = [q for q in dict.fromkeys(wanted) if column_of(path, table, q, bench.columns.get(q, {}))[0] is None]
     if len(missing) > 1:
         usual = ", ".join(bench.columns.get(q, {}).get("name", USUAL[q]) for q in missing)
@@ -188,7 +188,7 @@ def _refuse_clipping(name, columns, bench):
 
 
 def _one(name, columns, units, origin, bench) -> Recording:
-    quasistatic = bench.columns.get("time", {}).get("quasistatic")
+    quasistatic = bench.quasistatic
     count = len(columns[bench.drive])
     if count < 2:
         raise RecordingError(f"{name}: holds one sample only; record again, or check the columns and the split of the file")

@@ -667,7 +667,7 @@ def test_a_law_whose_first_order_misleads_is_fitted_from_elsewhere_too(ends, fit
 
 def test_zeros_of_the_recordings_are_dropped_where_an_effect_meets_the_means_too():
     """A fit in a valley may have asked for them before the effect was found."""
-    from fitting.diagnose import _needless_zeros
+    from fitting.own_signals import needless_zeros
 
     current = SimpleNamespace(chi2_per_sample=1.0, data_count=COUNT - 10, actuator=None, spectra=(), choices=Choices())
 
@@ -678,9 +678,9 @@ def test_zeros_of_the_recordings_are_dropped_where_an_effect_meets_the_means_too
 
     found = Reached(current, [("an effect",)], {})
     ten = (0.0,) * 9
-    assert _needless_zeros(Told((1.1, *ten), None), found) and not _needless_zeros(Told((1.2, *ten), None), found)
-    assert not _needless_zeros(Told((1.1,), None), found)  # one zero that takes as much
-    assert not _needless_zeros(Told((1.01, *ten), None), Reached(current, [], {}))  # the zeros are all there is
+    assert needless_zeros(Told((1.1, *ten), None), found) and not needless_zeros(Told((1.2, *ten), None), found)
+    assert not needless_zeros(Told((1.1,), None), found)  # one zero that takes as much
+    assert not needless_zeros(Told((1.01, *ten), None), Reached(current, [], {}))  # the zeros are all there is
 
 
 def test_details_of_a_law_that_were_held_are_no_size():

@@ -8,6 +8,7 @@ import pytest
 
 import fitting.diagnose as module
 import fitting.learned as learned_module
+import fitting.own_signals as signals_module
 import fitting.rough as rough_module
 import fitting.search as search_module
 from fitting.attribute import Trial, chi2_of, rivals_of
@@ -291,19 +292,19 @@ def test_means_are_set_free_where_they_hold_most_of_what_a_slow_effect_leaves(mo
 
     ends = {"freed": 1.1, "z": 42.0}
     own = RecordEffect("zero_drift", 42.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
-    monkeypatch.setattr(module, "zeros_score", lambda *a: (ends["z"], np.zeros(2), np.ones(2)))
-    monkeypatch.setattr(module, "zeros_of", lambda *a: [own])
+    monkeypatch.setattr(signals_module, "zeros_score", lambda *a: (ends["z"], np.zeros(2), np.ones(2)))
+    monkeypatch.setattr(signals_module, "zeros_of", lambda *a: [own])
     monkeypatch.setattr(Task, "fit", lambda task, actuator, **more: result(ends["freed"], "creep"))
     task = Task((Recording(np.arange(40.0), {"current": np.arange(40.0), "displacement": np.arange(40.0)}),), bench)
     best = result(2.3, "magnetic_aftereffect")
-    cleaned, found = module._unsettled_means(task, [], result(2.9, "creep"), best)
+    cleaned, found = signals_module.unsettled_means(task, [], result(2.9, "creep"), best)
     assert found == (own, []) and cleaned.recordings[0].origin["zero"] == 1e-5
-    assert module._unsettled_means(task, [(own, [])], result(2.9, "creep"), best) is None  # once
-    assert module._unsettled_means(task, [], result(2.9, "creep"), result(1.2, "backlash")) is None
-    assert module._unsettled_means(task, [], result(6.0, "creep"), best) is None  # the best serves better
+    assert signals_module.unsettled_means(task, [(own, [])], result(2.9, "creep"), best) is None  # once
+    assert signals_module.unsettled_means(task, [], result(2.9, "creep"), result(1.2, "backlash")) is None
+    assert signals_module.unsettled_means(task, [], result(6.0, "creep"), best) is None  # the best serves better
     for changed in ({"freed": 2.1}, {"freed": 1.1, "z": 20.0}):  # they take less than half of it
         ends.update(changed)
-        assert module._unsettled_means(task, [], result(2.9, "creep"), best) is None
+        assert signals_module.unsettled_means(task, [], result(2.9, "creep"), best) is None
 
 
 def test_a_drift_is_told_once():
@@ -330,30 +331,30 @@ def test_a_drift_is_told_once():
 )  # fmt: skip
 def test_means_go_with_a_drift_where_they_hold_nearly_all(monkeypatch, bench, drift, freed, free):
     own = RecordEffect("zero_drift", 90.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
-    monkeypatch.setattr(module, "zeros_score", lambda *a: (800.0, np.zeros(2), np.ones(2)))
-    monkeypatch.setattr(module, "zeros_of", lambda *a: [own])
+    monkeypatch.setattr(signals_module, "zeros_score", lambda *a: (800.0, np.zeros(2), np.ones(2)))
+    monkeypatch.setattr(signals_module, "zeros_of", lambda *a: [own])
     ended = a_fit(freed, 60.0)
     monkeypatch.setattr(Task, "fit", lambda task, actuator: ended)
     base = a_fit(960.0, 55.0)
     base.problem = base.refined = base.spectra = None
     base.data_count = ended.data_count = 600
     within = RecordEffect("thermal_drift", 60.0, 1e-5, 1e-7, {"tau": 30.0}, ())
-    found = module._own_zeros(Task((), bench), [(within, [])] if drift else [], base, [scored("linear_strain", 500.0)])
+    found = signals_module.own_zeros(Task((), bench), [(within, [])] if drift else [], base, [scored("linear_strain", 500.0)])
     assert (found is not None) == free and (not free or found[1] == (own, []) and found[2] is ended)
 
 
 @pytest.mark.parametrize(("coarse", "fine", "free"), [(2.5, 1.02, False), (2.5, 1.9, True)], ids=["an effect serves", "none does"])
 def test_effects_are_held_against_means_on_the_density_that_these_got(monkeypatch, bench, coarse, fine, free):
     """A strain_hysteresis left chi2/N 2.5 on the first hats; means of their own, with finer ones, 1.17. On these it leaves 1.15."""
-    monkeypatch.setattr(module, "zeros_score", lambda *a: (90.0, np.zeros(9), np.ones(9)))
+    monkeypatch.setattr(signals_module, "zeros_score", lambda *a: (90.0, np.zeros(9), np.ones(9)))
     own = RecordEffect("zero_drift", 90.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
-    monkeypatch.setattr(module, "zeros_of", lambda *a: [own])
+    monkeypatch.setattr(signals_module, "zeros_of", lambda *a: [own])
     base, freed, beside = a_fit(9.4, 55.0), a_fit(1.0, 60.0), a_fit(5.7, 56.0)
     for found, choices in ((base, Choices()), (freed, Choices(knots=(26, 18), level=104)), (beside, Choices(knots=(26, 18), level=104))):
         found.choices, found.problem, found.refined, found.spectra, found.data_count = choices, None, None, None, 1000
     monkeypatch.setattr(Task, "fit", lambda task, actuator: freed)
     monkeypatch.setattr(Task, "fit_on", lambda task, start, actuator, spectra: beside if start is freed else None)
-    monkeypatch.setattr(module, "settled", lambda task, base, trial, excess: trial)
+    monkeypatch.setattr(signals_module, "settled", lambda task, base, trial, excess: trial)
 
     def tried(task, start, candidate, excess):
         assert task.choices == freed.choices and start is beside
@@ -361,8 +362,8 @@ def test_effects_are_held_against_means_on_the_density_that_these_got(monkeypatc
         ended.data_count = 1000
         return trial(candidate.name, ended, 4000.0)
 
-    monkeypatch.setattr(module, "try_effect", tried)
-    found = module._own_zeros(Task((), bench), [], base, [scored("creep", 80.0), scored("strain_hysteresis", 75.0), scored("backlash", 60.0)])
+    monkeypatch.setattr(signals_module, "try_effect", tried)
+    found = signals_module.own_zeros(Task((), bench), [], base, [scored("creep", 80.0), scored("strain_hysteresis", 75.0), scored("backlash", 60.0)])
     assert (found is not None) == free
 
 
@@ -492,16 +493,16 @@ def test_a_sensors_zero_is_adopted_where_it_scores_best_and_told_of_where_an_eff
     runs = [dataclasses.replace(r, channels={**r.channels, "displacement": r.channels["displacement"] + zero}) for r in runs]
     task = Task(tuple(runs), bench)
     base = task.fit(refine=False)
-    monkeypatch.setattr(module, "screened", lambda result, choices: [])
+    monkeypatch.setattr(signals_module, "screened", lambda result, choices: [])
     task = task.on(choices=base.choices)
-    score = abs(module.offset_score(base.problem, base.refined))
+    score = abs(signals_module.offset_score(base.problem, base.refined))
     assert score > 8
     rival = SimpleNamespace(z=1.02 * score)
-    same, candidates, none, told = module._sensor_zero(task, base, [rival])
+    same, candidates, none, told = signals_module.sensor_zero(task, base, [rival])
     assert same is base and candidates == [rival] and none is None and told == pytest.approx(zero, abs=1.2e-6)
-    freed, _, found, none = module._sensor_zero(task, base, [SimpleNamespace(z=0.5 * score)])
+    freed, _, found, none = signals_module.sensor_zero(task, base, [SimpleNamespace(z=0.5 * score)])
     assert found == pytest.approx(zero, abs=1.2e-6) and none is None and freed.chi2_per_sample < base.chi2_per_sample
-    better = module._sensor_zero(task, base, [SimpleNamespace(z=2 * score)])
+    better = signals_module.sensor_zero(task, base, [SimpleNamespace(z=2 * score)])
     assert better[0] is base and better[2:] == (None, None)
 
 
@@ -519,12 +520,12 @@ def test_zeros_that_change_from_recording_to_recording_are_told(bench):
     ]
     task = Task(tuple(moved), bench, Choices())
     base = task.fit()
-    cleaned, (effect, rivals), freed = module._own_zeros(task, [], base, ())
+    cleaned, (effect, rivals), freed = signals_module.own_zeros(task, [], base, ())
     assert freed.chi2_per_sample < 1.15 < base.chi2_per_sample and effect.z > 8
     assert effect.name == "zero_drift" and [r.name for r in rivals] == ["thermal_drift"]
-    assert module._own_zeros(cleaned, [(effect, rivals)], freed, ()) is None  # once
+    assert signals_module.own_zeros(cleaned, [(effect, rivals)], freed, ()) is None  # once
     better = SimpleNamespace(name="creep", z=2 * effect.z)
-    assert module._own_zeros(task, [], base, (better,)) is None
+    assert signals_module.own_zeros(task, [], base, (better,)) is None
     s = freed.spectra[0]
     assert line_deviations(s, s.noise)[0] > 0.5 * s.peak_to_peak and line_deviations(s, s.noise)[1] < 1e-7
     # of a check recording its zero is not known either
@@ -534,7 +535,7 @@ def test_zeros_that_change_from_recording_to_recording_are_told(bench):
         for c in (remove_from_checks(check, [effect], bench), check)
     )
     assert error < 6e-8 and apart > 2e-7
-    (same,) = module.zeros_of(base.spectra, 9.0, zeros, zeros, ["zero_drift"])  # of what drifts within them there is no rival
+    (same,) = signals_module.zeros_of(base.spectra, 9.0, zeros, zeros, ["zero_drift"])  # of what drifts within them there is no rival
     assert same.name == "zero_drift"
 
 

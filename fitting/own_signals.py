@@ -1,0 +1,166 @@
+"""What the readings hold that no actuator makes: drift, heat and hum of a record, a sensor's zero, zeros and means of each recording.
+
+Adopted before the effects, or in their place where these do not serve as well; `task`: a `Task`, `adopted`: what was taken out of
+its recordings, each effect with its rivals.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from .attribute import BIC_DROP, CLOSE, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
+from .fit import FINER_FROM
+from .on_lines import hum_score, offset_score, zeros_score
+from .record_level import hum_is_seen, hum_of, record_effects, remove_record_effect, zeros_of
+from .rows import DRIFTS
+from .screen import screened
+from .setup import spectra_of
+from .verdict import SILENT_CHI2, Z_THRESHOLD, Diagnosis, least_excess
+
+RECORD_Z = 8.0
+FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
+MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
+NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
+MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the recordings must hold
+MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
+
+
+def record_level(recordings, spectra, bench, choices):
+    """Drift, heat and hum, scored between the harmonics: (adopted with their rivals, the recordings without them)."""
+    adopted = []
+    for _ in range(0 if bench.quasistatic or bench.output != "displacement" else 2):
+        known = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
+        found = [e for e in record_effects(recordings, spectra) if e.name not in known]
+        best = found[0]
+        if abs(best.z) < RECORD_Z:
+            break
+        rivals = [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z)]
+        adopted.append((best, rivals))
+        recordings = remove_record_effect(recordings, best, bench.output)
+        spectra = spectra_of(recordings, bench, choices.harmonics)
+    return adopted, recordings
+
+
+def hum_on_harmonics(task, adopted, base, candidates=()):
+    """Hum that falls on harmonics of the drive, where no repeat shows it: adopted if it scores above every effect and takes
+    most of what `base` leaves. Returns the task without it, the effect with its rivals, and its fit; None elsewhere.
+    """
+    held, bench = any(e.name == "mains_hum" for e, _ in adopted), task.bench
+    if held or bench.output != "displacement" or bench.quasistatic or not base.chi2_per_sample > SILENT_CHI2:
+        return None
+    excess = excess_of(base)
+    z, tones = hum_score(base.problem, base.refined)
+    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 for c in candidates)]) or not hum_is_seen(base.spectra, tones):
+        return None
+    effect = hum_of(base.spectra, z, tones)
+    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
+    freed = cleaned.fit(base.actuator)
+    if chi2_of(freed) > chi2_of(base) - MOST_OF_IT * excess:
+        return None
+    return cleaned, (effect, []), freed
+
+
+def own_zeros(task, adopted, base, candidates):
+    """A zero that changes from recording to recording: adopted if it promises about as much as any effect, alone meets the
+    noise, and the effects that promise as much do not serve as well. Beside a drift within the recordings, which goes on between
+    them, it need only take nearly all. Returns the task with free means, the effect with its rivals, and its fit; None elsewhere.
+    """
+    held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
+    if held or bench.output != "displacement" or bench.quasistatic or not base.chi2_per_sample > least_excess(base):
+        return None
+    excess = excess_of(base)
+    z, zeros, errors = zeros_score(base.problem, base.refined)
+    likely = [c for c in candidates if abs(c.z) > CLOSE * z]
+    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 * (1 - WEAK_TIE[0]) - TIE for c in candidates)]):
+        return None
+    effect, *rivals = zeros_of(base.spectra, z, zeros, errors, [e.name for e, _ in adopted])
+    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
+    freed = cleaned.fit(base.actuator)
+    drifts = any(e.name in DRIFTS for e, _ in adopted)
+    met = freed.chi2_per_sample < least_excess(freed) or (drifts and chi2_of(freed) < chi2_of(base) - NEARLY_ALL * excess)
+    if not met or chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
+        return None
+    cost = chi2_of(freed) + len(zeros) * np.log(freed.data_count)
+    if freed.choices != base.choices:  # on the same density: a rough one would speak against them
+        task = task.on(choices=freed.choices)
+        base = task.fit_on(freed, base.actuator, spectra=base.spectra)
+        excess = excess_of(base)
+    trials = (settled(task, base, try_effect(task, base, c, excess), excess) for c in likely[:MOST_LIKELY])
+    if any(t.physical and chi2_of(t.result) + t.parameters * np.log(freed.data_count) < cost for t in trials):
+        return None
+    return cleaned, (effect, rivals), freed
+
+
+def unsettled_means(task, adopted, slow, best):
+    """Means that an effect has brought as far in each recording as the drive had run before: set free where they hold most of
+    what the fit with this `slow` effect leaves, and so serve better than the `best` of all. Returns the task with free means
+    and the effect with its rivals; None elsewhere.
+
+    Its law has one such number for all recordings; with the others wrong, another slow effect that bends the means serves better.
+    """
+    held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
+    if held or bench.output != "displacement" or bench.quasistatic or not best.chi2_per_sample > MISFIT:
+        return None
+    excess = excess_of(slow)
+    z, zeros, errors = zeros_score(slow.problem, slow.refined)
+    cost = len(zeros) * np.log(best.data_count) + BIC_DROP
+    if z**2 < MEANS_HOLD * excess or chi2_of(slow) - z**2 + cost > chi2_of(best):
+        return None
+    task.say("with means of their own", slow.chi2_per_sample)
+    effect, *rivals = zeros_of(slow.spectra, z, zeros, errors, [e.name for e, _ in adopted])
+    cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
+    freed = cleaned.fit(slow.actuator, start=slow, choices=slow.choices, refine=False)
+    met = chi2_of(freed) < min(chi2_of(slow) - MEANS_HOLD * excess, chi2_of(best) - cost)
+    return (cleaned, (effect, rivals)) if met else None
+
+
+def needless_zeros(task, reached) -> bool:
+    """Whether the recordings with their means are met by the effects that were found beside zeros of their own, nearly as well.
+
+    `task`: before the means were set free."""
+    if not reached.steps:
+        return False
+    current = reached.current
+    task.say("with the means again", current.chi2_per_sample)
+    again = task.fit(current.actuator, start=current, choices=current.choices, refine=False)
+    cost = 2 * len(task.recordings) * np.log(again.data_count)
+    return again.chi2_per_sample < SETTLED_CHI2 and chi2_of(again) < chi2_of(current) + cost
+
+
+def sensor_zero(task, base, candidates):
+    """A sensor whose zero is not the rod's rest: part of the base, if it scores above any effect and alone meets the noise.
+
+    Returns the base, its candidates, the zero, m, or None, and the zero that would explain as much as the best effect, or None.
+    """
+    as_it_is, bench = (base, candidates, None, None), task.bench
+    if bench.output != "displacement" or bench.drive == "voltage" or "sensor.offset" in bench.free:
+        return as_it_is
+    best, excess = max((c.z**2 for c in candidates), default=0.0), excess_of(base)
+    score = offset_score(base.problem, base.refined) ** 2
+    tied = max(TIE, WEAK_TIE[0] * best)
+    needed = min(best - tied, 0.5 * excess) if base.chi2_per_sample > FAR_ZERO else best - tied
+    if score < max(Z_THRESHOLD**2, needed):
+        return as_it_is
+    free = (*task.held, "sensor.offset")
+    freed = task.fit_on(base, extra=free, choices=base.choices)
+    if chi2_of(freed) > chi2_of(base) - max(0.5 * excess, MIN_DROP):
+        return as_it_is
+    if freed.chi2_per_sample > FINER_FROM[0]:  # the density was chosen under the misfit
+        freed = task.fit(extra=free, spectra=base.spectra)
+    if freed.chi2_per_sample > SILENT_CHI2:
+        return as_it_is
+    zero = freed.estimate("sensor.offset").value
+    if score < best + tied and base.chi2_per_sample < FAR_ZERO:
+        return base, candidates, None, zero
+    return freed, screened(freed, task.choices), zero, None
+
+
+def with_zero(found, zero, rival) -> Diagnosis:
+    """The diagnosis with a word on the sensor's zero: adopted, or told of beside an effect that does as well."""
+    if zero is not None:
+        note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
+    elif rival is not None and (found.effects or found.groups):
+        note = f" A sensor's zero {rival:.3g} m away from the rod's rest would explain as much; if it was not set there, free sensor.offset in the bench file."
+    else:
+        return found
+    return dataclasses.replace(found, message=found.message + note)
