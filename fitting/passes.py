@@ -13,6 +13,7 @@ import numpy as np
 
 from magjax.programs import kept
 
+from .columns import marching
 from .density import COLUMNS
 from .model import MEMORY, Target, whitened
 from .solver import pushed
@@ -76,12 +77,11 @@ class Passes:
 
     def __init__(self, problem):
         self.problem, layout, template = problem, problem.layout, problem.template
-        marching = tuple(e for e in template.effects if e.marches)
         behind = {f"effects.{e.name}" for e in template.effects if not e.marches}
         own = [f"effects.{e.name}.{n}" for e in template.effects for n in e.parameters()]
         free = [n for n in layout.names if n not in own]
         moving = sorted(n for n in (*free, *own) if n.rpartition(".")[0] not in behind and not n.startswith("sensor."))
-        self.march = _Template(dataclasses.replace(template, effects=marching), tuple(moving), layout)
+        self.march = _Template(marching(template), tuple(moving), layout)
         self.read = _Template(template, tuple(sorted((*free, *own))), layout)
         self.total, self.tops = float(layout.total), [np.asarray(t[:, -1, 0]) for t in map(np.asarray, layout.tables)]
         self.held = None if layout.held is None else float(np.sum(layout.held))
