@@ -41,6 +41,7 @@ from .verdict import (
     misfit,
     unexplained,
     verdict,
+    without_worse,
 )
 
 ABSORBED_VISIBILITY = 0.004
@@ -214,6 +215,7 @@ def _concluded(task, evidence) -> Diagnosis:
     if found.verdict == "unknown_at" and not rough and (rougher := beside_cells(task, evidence)):
         return verdict(rougher, rough=True)
     if found.verdict == "unknown_at":
+        found = without_worse(evidence, found)
         return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], task.progress)
     if (rough or found.repaired is not None) and (finer := by_cells(task, evidence)):
         again = verdict(finer)

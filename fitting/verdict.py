@@ -41,6 +41,7 @@ CREEPS_TEXT = " The slow drift within the records, which was taken out of them, 
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
+PLAIN_TEXT = "The model offered is the plain one, which predicts the check recordings better than any repair."
 UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 
@@ -365,6 +366,17 @@ def unexplained(evidence, found) -> Diagnosis:
     """The `unknown_at` in place of a verdict that named an effect."""
     names = ("floors", "where", "absorbed", "base", "check", "candidates", "repaired")
     return _unknown(evidence, {name: getattr(found, name) for name in names})
+
+
+def without_worse(evidence, found) -> Diagnosis:
+    """The diagnosis of an unknown without a repair that foretells the check recordings worse than the plain model: that one is offered."""
+    if not found.repaired or misfit(found.check, "rms_after") <= misfit(found.check, "rms_before"):
+        return found
+    plain = evidence.plain
+    raw, clean = evidence.checks
+    rows = check_errors(evidence.raw.actuator, plain.actuator, raw, evidence.bench, clean)
+    rows = evidence.reached.foretell.beside(rows, plain) if evidence.reached.foretell else rows
+    return dataclasses.replace(found.noted(PLAIN_TEXT), check=tuple(rows), repaired=plain if evidence.adopted else None)
 
 
 def _unknown(evidence, common, note: str = "") -> Diagnosis:

@@ -9,6 +9,7 @@ import pytest
 import fitting.attribute
 import fitting.exchange
 import fitting.search
+import fitting.verdict
 from fitting.attribute import Trial, _physical, chi2_of, confidence, family, leaders, rivals_of, tie_of
 from fitting.record_level import RecordEffect
 from fitting.rows import behind, creeps_on, sizes_of, ties_of
@@ -342,6 +343,24 @@ def test_a_law_bent_into_another_is_not_named(effect, physical):
     assert _physical(effect, a_fit_of((0.0, 5e-5))) is physical
 
 
+def evidence_of(monkeypatch, chi2n, before, after):
+    """`verdict.Evidence` of one effect that ends at `chi2n`, from 220, and misses two check recordings so many times their noise."""
+    import fitting.verdict as module
+
+    rows = [
+        {"file": "c", "unit": "m", "rms_before": b * 4e-8, "rms_after": a * 4e-8, "noise_rms": 4e-8}
+        for b, a in zip(before, after, strict=True)
+    ]
+    monkeypatch.setattr(module, "check_errors", lambda *a: rows)
+    monkeypatch.setattr(module, "exchange", lambda *a: None)
+    monkeypatch.setattr(module, "found_rows", lambda e: ([{"name": "creep", "block": "mechanics"}], [], {}, []))
+    plain = SimpleNamespace(chi2_per_sample=220.0, data_count=COUNT, actuator=None)
+    current = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=None)
+    reached = Reached(current, [(trial("creep", chi2n, base=220.0), [], [], plain)], {})
+    where = {"by_block": {"mechanics": 1.0}, "by_field": []}
+    return module.Evidence(reached, (), plain, plain, (), (), SimpleNamespace(drive="current"), (["check"], ["check"]), {}, where, ())
+
+
 @pytest.mark.parametrize(
     ("chi2n", "before", "after", "word"),
     [
@@ -362,23 +381,20 @@ def test_a_law_bent_into_another_is_not_named(effect, physical):
 )
 def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, chi2n, before, after, word):
     """One of two check recordings may get better and the other far worse: together they are worse."""
-    import fitting.verdict as module
+    assert fitting.verdict.verdict(evidence_of(monkeypatch, chi2n, before, after)).verdict == word
 
-    rows = [
-        {"file": "c", "unit": "m", "rms_before": b * 4e-8, "rms_after": a * 4e-8, "noise_rms": 4e-8}
-        for b, a in zip(before, after, strict=True)
-    ]
-    monkeypatch.setattr(module, "check_errors", lambda *a: rows)
-    monkeypatch.setattr(module, "exchange", lambda *a: None)
-    monkeypatch.setattr(module, "found_rows", lambda e: ([{"name": "creep", "block": "mechanics"}], [], {}, []))
-    plain = SimpleNamespace(chi2_per_sample=220.0, data_count=COUNT, actuator=None)
-    current = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=None)
-    reached = Reached(current, [(trial("creep", chi2n, base=220.0), [], [], plain)], {})
-    where = {"by_block": {"mechanics": 1.0}, "by_field": []}
-    evidence = module.Evidence(
-        reached, (), plain, plain, (), (), SimpleNamespace(drive="current"), (["check"], ["check"]), {}, where, ()
-    )
-    assert module.verdict(evidence).verdict == word
+@pytest.mark.parametrize(("after", "offered"), [((1.05, 3.0), False), ((5.0, 4.0), True)], ids=["worse", "better"])
+def test_an_unknown_offers_no_repair_that_foretells_worse(monkeypatch, after, offered):
+    """A clipping amplifier in place of one with a dead zone missed a check recording by 8 um, where the plain model missed 0.2."""
+    evidence = evidence_of(monkeypatch, 11.0, (1.4, 8.0) if offered else (1.4, 2.0), after)
+    found = fitting.verdict.verdict(evidence)
+    assert found.verdict == "unknown_at" and found.repaired is evidence.reached.current
+    before = [r["rms_before"] for r in found.check]
+    monkeypatch.setattr(fitting.verdict, "check_errors", lambda a, b, *_: [r | {"rms_after": r["rms_before"]} for r in found.check])
+    found = fitting.verdict.without_worse(evidence, found)
+    assert (found.repaired is not None) is offered
+    assert ([r["rms_after"] for r in found.check] == before) is not offered
+    assert ("The model offered is the plain one" in found.message) is not offered
 
 
 def searched(monkeypatch, ends, follows):
