@@ -193,7 +193,7 @@ def equation_error_start(basis, spectra, deviations, actuator, max_frequency=Non
         rows.append(np.column_stack([Phi, np.ones(len(H))]) * trust[:, None])
         values.append(M / basis.total * trust)
     A, b = np.concatenate(rows), np.concatenate(values)
-    tolerance = 0.01 * np.abs(b).max()
+    tolerance = 0.01 * (np.abs(b).max() or 1.0)  # a reading of the wrong sign is no strain at all
     A, b = A / tolerance, b / tolerance
     n = basis.unknowns
     normal, gradient = A.T @ A, -A.T @ b

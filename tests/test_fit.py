@@ -22,7 +22,7 @@ from fitting.recipe import recipe_beside
 from fitting.setup import Choices, build_problem, free_parameters, spectra_of
 from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
-from fitting.starts import agreeing, operator_rows, unfold
+from fitting.starts import agreeing, equation_error_start, operator_rows, unfold
 from magjax.bench import load_bench
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.preisach import Preisach, density_masses
@@ -409,6 +409,17 @@ def test_unfold_sees_through_noise(offset):
         reading = M**2 + 1e-3 * rng.standard_normal(200)
         found = unfold(np.sqrt(np.maximum(reading, 0.0)), drive)
         assert np.sqrt(np.mean((found - M * np.sign(M[np.argmax(drive)])) ** 2)) < 0.1
+
+
+def test_a_reading_that_is_negative_throughout_starts_without_a_warning(recordings, bench):
+    """No strain of the rod is negative: there is no M behind it, and nothing to scale by."""
+    turned = [dataclasses.replace(r, channels={**r.channels, "displacement": -r.channels["displacement"]}) for r in recordings]
+    spectra, actuator = spectra_of(turned, bench, 8), bench.actuator()
+    deviations = [np.full(9, 1e-9)] * len(spectra)
+    basis = hat_basis(-2e4, 4e4, 1e5, 20, 6, 5)
+    with np.errstate(all="raise"):
+        x, bottom, misfit = equation_error_start(basis, spectra, deviations, actuator)
+    assert np.isfinite(x).all() and np.isfinite([bottom, misfit]).all()
 
 
 def test_loops_whose_strain_does_not_come_back_to_zero_are_begun_with_its_sign_turned(tmp_path):
