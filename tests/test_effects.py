@@ -226,6 +226,24 @@ def test_creep_weighs_its_lags_by_a_power_of_time():
             assert lost == pytest.approx(-np.log10((1 + s * 2e-3) / (1 + s * 100)), rel=1e-6)
 
 
+def test_structural_damping_is_a_solid_of_many_relaxations_from_the_mean_to_the_resonance():
+    """Maxwell branches spread evenly over the logarithm of time up to 3 s: K = K0 (1 + g ln(1 + 3 s)), the mean at rest in K0."""
+    rod, longest, g = actuator(20).replace({"mechanics.f0": 500.0, "mechanics.xi": 0.2}), 3.0, 0.01
+    w0, dt = 2 * np.pi * 500.0, 1e-3
+    line, signal = Timeline(jnp.asarray(dt), 200, True), 2.0 + jnp.sin(2 * jnp.pi * jnp.arange(200) / 200)  # 5 Hz
+    there = 1 + g * np.log(w0 * longest)  # K / K0 at the resonance, which f0 tells
+    effect = effects.StructuralDamping(
+        eta=g * np.pi / 2 / there, dispersion=1.0, exponent=1e-6, mean_below=np.log10(w0 * longest)
+    )
+    still = line.filter(signal, rod.mechanics.response)
+    found = np.fft.rfft(np.asarray(effect.displacement(still, signal, None, line, rod)))[:2] / np.fft.rfft(np.asarray(signal))[:2]
+    for s, got in zip((0.0, 2j * np.pi * 5), found, strict=True):
+        stiffness = w0**2 * (1 + g * np.log(1 + longest * s)) / there
+        want = w0**2 / (s**2 + 2 * 0.2 * w0 * s + stiffness)
+        assert got == pytest.approx(want, rel=2e-4)
+    assert found[0].real > 1.08  # the mean has the static compliance
+
+
 def test_backlash_in_detail_is_a_mean_of_plays_beside_an_elastic_path():
     y = 1e-5 * np.sin(2 * np.pi * np.arange(400) / 400)
     line = Timeline(jnp.asarray(1e-3), 400, True)

@@ -11,7 +11,8 @@ class StructuralDamping(AbstractEffect):
     """Complex stiffness w0^2 (1 + loss), with the fractional Kelvin element loss = eta ((i w / w0)^a - 1) / sin(pi a / 2).
 
     Its imaginary part hardly changes with frequency where the exponent a is small; a causal solid then stiffens as the
-    logarithm of frequency (dispersion 1). The classic constant loss factor does not (dispersion 0, a to 0). One for the mean.
+    logarithm of frequency (dispersion 1). The classic constant loss factor does not (dispersion 0, a to 0). The mean level
+    has the stiffness of `mean_below` decades under the resonance: at zero, the resonance's own.
     """
 
     eta: Float[Array, ""] = param(0.0, "1", "loss factor", low=0.0, scale=0.02, null=0.0, typical=(0.001, 0.2))
@@ -20,6 +21,9 @@ class StructuralDamping(AbstractEffect):
     )
     exponent: Float[Array, ""] = param(
         0.05, "1", "order of the fractional derivative", low=0.0, scale=0.05, shape=True, typical=(0.01, 0.5)
+    )
+    mean_below: Float[Array, ""] = param(
+        0.0, "1", "decades below the resonance, whose stiffness the mean level has", scale=2.0, shape=True, typical=(0.0, 5.0)
     )
 
     name = "structural_damping"
@@ -39,7 +43,8 @@ class StructuralDamping(AbstractEffect):
             quarter = 0.5 * jnp.pi * jnp.maximum(self.exponent, 1e-6)
             power = ratio ** jnp.maximum(self.exponent, 1e-6)
             stiffer = (power * jnp.cos(quarter) - 1) / jnp.sin(quarter)
-            loss = self.eta * (w > 0) * (1j * power + self.dispersion * stiffer)
+            softer = (10.0 ** (-jnp.maximum(self.exponent, 1e-6) * self.mean_below) - 1) / jnp.sin(quarter)
+            loss = self.eta * jnp.where(w > 0, 1j * power + self.dispersion * stiffer, self.dispersion * softer)
             return -base * loss * base / (1 + loss * base)
 
         return displacement + line.filter(free_displacement, change)
