@@ -121,6 +121,7 @@ def foretold(result, spectra) -> Foretold:
     for k, s in enumerate(spectra):
         deviations = _deviations(problem, s)
         finite = np.where(np.isfinite(deviations), deviations, 0.0)
+        finite[0] *= not s.zero  # what has a zero of its own is held against the prediction's mean
         weights = np.concatenate([finite**2 * np.where(np.arange(len(finite)) > 0, 2.0, 1.0), 2 * finite[1:] ** 2])
         unknown = float(weights @ np.diag(spread)[k * lines : (k + 1) * lines])
         expected.append(float(np.sqrt(unknown + s.noise_rms**2)))

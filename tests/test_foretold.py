@@ -78,6 +78,14 @@ def test_what_is_expected_is_the_spread_of_predictions(bench, null, plain):
     assert np.all(np.abs(expected / spread - 1) < 0.3)
 
 
+def test_a_mean_that_is_not_held_against_anything_is_not_expected_to_be_missed(null, plain):
+    """Beside zeros of the recordings' own a creep knew nothing of its mean: 4.9 um were expected, 26 nm missed."""
+    own = [dataclasses.replace(r, origin={**r.origin, "zero": 1e-6}) for r in null[1]]
+    whole, shape = ([row["expected_rms"] for row in Foreteller(runs, plain).beside([{}] * 3, plain)] for runs in (null[1], own))
+    noise = [s.noise_rms for s in Foreteller(own, plain).spectra]
+    assert all(n < b < 0.999 * a for a, b, n in zip(whole, shape, noise, strict=True))
+
+
 def test_check_recordings_speak_for_what_is_there_and_not_for_what_is_not(bench, null, plain):
     effect = QuarticMagnetostriction()
     extra = ("effects.quartic_magnetostriction.b",)
