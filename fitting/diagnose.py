@@ -13,6 +13,7 @@ from magjax.effects import CLASSES
 
 from .alternation import alternating
 from .attribute import (
+    FEEDBACKS,
     LIKE_DENSITY,
     MIN_DROP,
     MISFIT,
@@ -246,9 +247,10 @@ def _wrong_name(task, evidence, found):
 
 
 def _absorbed(candidates, tried) -> tuple[str, ...]:
-    """What these recordings could not show: the density makes nearly all of it. What scores or was fitted did show."""
+    """What these recordings could not show: the density makes nearly all of it, or bends to it beyond what its column tells. What
+    scores or was fitted did show."""
     silent = [c for c in candidates if abs(c.z) < Z_THRESHOLD and c.name not in tried]
-    return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in LIKE_DENSITY)
+    return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in (*LIKE_DENSITY, *FEEDBACKS))
 
 
 def _better_valley(task, plain, candidates, current):

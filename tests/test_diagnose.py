@@ -383,8 +383,9 @@ def test_silent_on_random_cells(tmp_path, number):
 
 def test_what_scores_or_was_fitted_is_not_absorbed():
     candidates = [scored("quartic_magnetostriction", 22.8, 0.003), scored("linear_strain", 3.0, 0.003), scored("mean_field", 2.0)]
-    candidates += [scored("accommodation", 4.0, 0.003), scored("creep", 1.0)]
-    assert module._absorbed(candidates, {"accommodation": None}) == ("linear_strain", "mean_field")
+    candidates += [scored("accommodation", 4.0, 0.003), scored("creep", 1.0), scored("stress_feedback", 0.2)]
+    assert module._absorbed(candidates, {"accommodation": None}) == ("linear_strain", "mean_field", "stress_feedback")
+    assert "stress_feedback" not in module._absorbed([scored("stress_feedback", 9.0)], {})
 
 
 @pytest.mark.parametrize("inside", ["the first fit", pytest.param("trials side by side", marks=pytest.mark.long)])
