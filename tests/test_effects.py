@@ -232,9 +232,7 @@ def test_structural_damping_is_a_solid_of_many_relaxations_from_the_mean_to_the_
     w0, dt = 2 * np.pi * 500.0, 1e-3
     line, signal = Timeline(jnp.asarray(dt), 200, True), 2.0 + jnp.sin(2 * jnp.pi * jnp.arange(200) / 200)  # 5 Hz
     there = 1 + g * np.log(w0 * longest)  # K / K0 at the resonance, which f0 tells
-    effect = effects.StructuralDamping(
-        eta=g * np.pi / 2 / there, dispersion=1.0, exponent=1e-6, mean_below=np.log10(w0 * longest)
-    )
+    effect = effects.StructuralDamping(eta=g * np.pi / 2 / there, dispersion=1.0, exponent=1e-6, mean_below=np.log10(w0 * longest))
     still = line.filter(signal, rod.mechanics.response)
     found = np.fft.rfft(np.asarray(effect.displacement(still, signal, None, line, rod)))[:2] / np.fft.rfft(np.asarray(signal))[:2]
     for s, got in zip((0.0, 2j * np.pi * 5), found, strict=True):
