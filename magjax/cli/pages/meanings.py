@@ -81,7 +81,7 @@ DIAGNOSIS = {
     "next_experiment": "null, or the recording that best tells the rivals apart",
     "placebo": "null, or how often the same search cries wolf on simulations of the final model (--placebo)",
     "base": "the content of fit.json for the model without the effects",
-    "repaired": "the same with them; null where nothing was added",
+    "repaired": "the same with them; null where nothing was added, or what was explains too little and foretells the check recordings worse",
     "reproduce": "the command that made it; in the file, not in what `--json` prints",
     "versions": "of magjax, jax, numpy and Python, in words; in the file likewise",
 }
