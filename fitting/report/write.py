@@ -25,7 +25,7 @@ def write_fit(folder: Path, result, recordings, content: dict, reproduce: str, p
 
     folder = Path(folder)
     content = {**content, "reproduce": reproduce, "versions": versions()}
-    write_atomically(folder / "fit.json", as_json(content, indent=1))
+    _write_numbers(folder / "fit.json", content)
     write_model(folder, result.actuator, result.bench)
     _say(progress, "report: signals")
     found = {**evidence.of_fit(result), "drive": result.bench.drive}
@@ -47,7 +47,7 @@ def write_diagnosis(
 
     folder = Path(folder)
     content = {**content, "reproduce": reproduce, "versions": versions()}
-    write_atomically(folder / "diagnosis.json", as_json(content, indent=1))
+    _write_numbers(folder / "diagnosis.json", content)
     base, repaired = diagnosis.base, diagnosis.repaired
     best = repaired or base
     found = {}
@@ -73,6 +73,13 @@ def write_diagnosis(
             found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench, own_zeros)
     store.save(folder, found)
     rebuild(folder, progress)
+
+
+def _write_numbers(path: Path, content: dict) -> None:
+    """The JSON of a result; the page of an earlier one goes with it, so that none stands beside numbers that are not its own."""
+    write_atomically(path, as_json(content, indent=1))
+    for name in ("report.html", "report.npz"):
+        path.with_name(name).unlink(missing_ok=True)
 
 
 def catalogue(terms=MAGNETIC) -> dict:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from fitting.locate import where
-from fitting.report import rebuild, store, write_diagnosis
+from fitting.report import rebuild, store, write_diagnosis, write_fit
 from fitting.report.banner import headline, tone
 from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, interval, placebo_section
 from fitting.report.fit_page import diagnose_command, sentence, validity
@@ -641,3 +641,24 @@ def test_many_recordings_stay_below_a_megabyte(folders, tmp_path):
     (tmp_path / "diagnosis.json").write_text(json.dumps(found))
     store.save(tmp_path, evidence)
     assert rebuild(tmp_path).stat().st_size < 1_000_000
+
+
+@pytest.mark.parametrize("name", ["fit", "attributed"])
+def test_the_page_of_an_earlier_result_does_not_outlive_its_numbers(tmp_path, monkeypatch, folders, fitted, diagnoses, runs, name):
+    """Ctrl-C between the numbers and the page left the page of the result before."""
+    from fitting.report import evidence
+
+    shutil.copytree(folders[name], tmp_path / "again")
+
+    def stopped(*a, **k):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evidence, "of_fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        if name == "fit":
+            write_fit(tmp_path / "again", fitted, runs[0], fitted.as_dict(), "")
+        else:
+            found = diagnoses[name]
+            write_diagnosis(tmp_path / "again", found, runs[0], found.as_dict(), "")
+    left = {p.name for p in (tmp_path / "again").iterdir()}
+    assert not left & {"report.html", "report.npz"} and left & {"fit.json", "diagnosis.json"}
