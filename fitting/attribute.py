@@ -142,7 +142,7 @@ def settled(task, base, trial, excess, target: float = np.inf) -> Trial:
     if not result.converged and chi2_of(result) < target:
         result = task.fit_on(result, result.actuator, choices=result.choices, spectra=base.spectra, target=target)
         trial = credited(trial.candidate, result, base, result.actuator.effect(trial.name), excess)
-    return _gone_on(task, base, trial, excess, _further_starts(base, trial), MISFIT)
+    return _gone_on(task, base, trial, excess, _further_starts(base, trial), MISFIT, target)
 
 
 def to_the_end(task, base, candidate, excess):
@@ -155,17 +155,17 @@ def in_detail(task, base, trial, excess) -> Trial:
     return _gone_on(task, base, trial, excess, _details(trial), 0.0)
 
 
-def _gone_on(task, base, trial, excess, starts, above) -> Trial:
+def _gone_on(task, base, trial, excess, starts, above, target: float = np.inf) -> Trial:
     """The trial, or the best that other `starts` of its effect lead to, where it takes a part of the misfit and leaves a chi2/N
-    `above` this, and they take enough more."""
+    `above` this, and they take enough more; those that cannot come near the `target` end early."""
     best = trial
     for start, of in starts:
         result = best.result
         if not (best.explained_share > DETAIL_SHARE and result.chi2_per_sample > above):
             break
-        same = {"choices": result.choices, "spectra": base.spectra}
+        same = {"choices": result.choices, "spectra": base.spectra, "target": target}
         finer = task.fit_on(of, of.actuator.with_effect(start), **same)
-        if not finer.converged:
+        if not finer.converged and chi2_of(finer) < target:
             finer = task.fit_on(finer, finer.actuator, **same)
         finer = credited(trial.candidate, finer, base, start, excess)
         best = finer if finer.bic_change < best.bic_change - BIC_DROP else best

@@ -229,16 +229,15 @@ def _concluded(task, evidence) -> Diagnosis:
 
 
 def _wrong_name(task, evidence, found):
-    """A learned term that serves far better than the effect that was named, in another block, and foretells the check recordings
-    no worse, where that effect leaves a misfit; None elsewhere."""
+    """A learned term that serves far better than the effects that were named, in another block, and foretells the check recordings
+    no worse, where these leave a misfit; None elsewhere."""
     alone = evidence if len(evidence.reached.steps) == 1 else first_alone(evidence)
-    if found.verdict not in ("attributed", "group") or alone is None or not found.repaired.chi2_per_sample > LEAVES_MISFIT:
+    named = alone if alone is not None and found.repaired is alone.reached.current else evidence
+    steps, current = named.reached.steps, named.reached.current
+    if found.verdict not in ("attributed", "group") or not steps or not found.repaired.chi2_per_sample > LEAVES_MISFIT:
         return None
-    if alone is not evidence and found.repaired is not alone.reached.current:
-        return None
-    steps, current = alone.reached.steps, alone.reached.current
-    blocks = {t.candidate.block for t in steps[0][1]}
-    learned = better_learned(evidence.plain, current, blocks, evidence.recordings, evidence.bench, task.progress)
+    blocks = {t.candidate.block for _, rivals, *_ in steps for t in rivals}
+    learned = better_learned(evidence.plain, current, blocks, evidence.recordings, evidence.bench, len(steps), task.progress)
     if learned is None:
         return None
     rows = check_errors(current.actuator, learned.result.actuator, evidence.checks[1], evidence.bench)

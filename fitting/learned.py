@@ -28,7 +28,7 @@ TRIED = 4  # leaders that are fitted jointly
 NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
 CLOSE = 0.96
-SIMPLER, SOME_WAY = 0.93, 0.8  # of the evidence is enough for one variable in place of two, or to be tried beside it
+SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned function leaves where the effect is the wrong name
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
@@ -135,19 +135,26 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
 
 def chosen_places(places) -> list[Place]:
     """Places worth a joint fit: of each block whose evidence comes near the first, a function of one variable where it
-    serves nearly as well, else the best; in the first block both where the simpler one comes some way: it may foretell more."""
+    serves nearly as well, else the best; in the first block two simple ones beside it where they come some way: one that is right
+    foretells more, and its evidence is low where the rest of the model has bent to what is missing."""
     best = places[0].evidence
     chosen = []
     for block in dict.fromkeys(p.block for p in places):
         mine = [p for p in places if p.block == block]
         if mine[0].evidence <= NEAR * best:
             continue
-        simple = next((p for p in mine if p.simple), mine[0])
-        if simple.evidence > (SIMPLER if chosen else SOME_WAY) * mine[0].evidence:
-            chosen.append(simple)
-        if simple.evidence <= SIMPLER * mine[0].evidence:
-            chosen.append(mine[0])
+        serves = any(p.simple and p.evidence > SIMPLER * mine[0].evidence for p in mine)
+        least, most = (SIMPLER, 1) if chosen or serves else (SOME_WAY, 2)
+        chosen += [p for p in mine if p.simple and p.evidence > least * mine[0].evidence][:most]
+        chosen += [] if serves else [mine[0]]
     return chosen[:TRIED]
+
+
+def _needless(place, tried) -> bool:
+    """Whether one of those tried meets the noise and is as simple and far ahead to first order, or is simple in the same block."""
+    met = [t for t in tried if t.result.chi2_per_sample < MET]
+    same = any(t.place.simple and t.place.block == place.block for t in met) and not place.simple
+    return same or any(place.evidence < CLOSE * t.place.evidence for t in met)
 
 
 def learn(base, recordings, bench, progress=None) -> Learned | None:
@@ -159,8 +166,7 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
         return None
     tried = []
     for place in chosen_places(places):
-        met = [t for t in tried if t.result.chi2_per_sample < MET and place.evidence < CLOSE * t.place.evidence]
-        if not met:
+        if not _needless(place, tried):
             let_go()
             tried.append(fit_term(base, place, recordings, bench, progress))
     tried = sorted((t for t in tried if np.isfinite(t.result.chi2_per_sample)), key=lambda t: t.left_out[1])
@@ -284,14 +290,14 @@ def described(learned: Learned) -> dict:
     }  # fmt: skip
 
 
-def better_learned(base, named, blocks, recordings, bench, progress=None) -> Learned | None:
-    """A term that shows an effect to be the wrong name: as simple, in another block than `blocks`, it leaves next to nothing of
-    what the effect leaves, and foretells recordings left out better. None elsewhere.
+def better_learned(base, named, blocks, recordings, bench, number: int = 1, progress=None) -> Learned | None:
+    """A term that shows effects to be the wrong names: in another block than `blocks`, it leaves next to nothing of what they
+    leave, and foretells recordings left out better; in place of one effect it must be as simple. None elsewhere.
 
-    `base`: the plain fit; `named`: that with the effect.
+    `base`: the plain fit; `named`: that with the effects, their `number`.
     """
     learned = learn(base, recordings, bench, progress)
-    if learned is None or not learned.place.simple or learned.place.block in blocks:
+    if learned is None or learned.place.block in blocks or not (number > 1 or learned.place.simple):
         return None
     left, least = (r.chi2_per_sample - AT_NOISE for r in (learned.result, named))
     far = left > WRONG_NAME * least or learned.left_out[1] > left_out(named.problem, named.solution).mean()

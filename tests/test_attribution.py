@@ -627,11 +627,15 @@ def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch
     monkeypatch.setattr(
         fitting.attribute, "credited", lambda c, result, base, effect, excess: trial(c.name, ends, len(effect.free_parameters()))
     )
-    asked = []
-    task = SimpleNamespace(fit_on=lambda start, effect, **more: asked.append(effect) or SimpleNamespace(converged=True))
-    found = fitting.attribute.settled(task, SimpleNamespace(spectra=None), plain, 1.0)
+    asked, targets = [], []
+
+    def fit_on(start, effect, target, **more):
+        asked.append(effect), targets.append(target)
+        return SimpleNamespace(converged=True)
+
+    found = fitting.attribute.settled(SimpleNamespace(fit_on=fit_on), SimpleNamespace(spectra=None), plain, 1.0, 800.0)
     assert (found is not plain) == detailed and bool(asked) == (share > 0.3)
-    assert all(float(effect.stribeck) > 0 for effect in asked)
+    assert all(float(effect.stribeck) > 0 for effect in asked) and set(targets) <= {800.0}  # what others meet, these must, too
 
 
 def test_a_plain_fit_that_settled_in_a_valley_is_begun_anew_from_where_effects_led():

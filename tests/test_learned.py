@@ -11,7 +11,7 @@ import pytest
 
 import fitting.learned as learned_module
 from fitting.demo import concealed_actuator, record
-from fitting.learned import Learned, band, described, left_out, prediction_interval, region
+from fitting.learned import Learned, _needless, band, chosen_places, described, left_out, prediction_interval, region
 from fitting.nonparametric import Place, evidence, prior_deviations
 from fitting.result import write_model
 from magjax.bench import load_bench
@@ -136,6 +136,28 @@ def test_a_loss_that_depends_on_the_magnetization_is_placed_in_the_coil():
     assert (learned.place.block, learned.place.joined(str)) == ("coil", "magnetization, times flux_rate")
     assert learned.result.chi2_per_sample < 1.1
     assert {p.block for p in learned.rivals} == {"magnetostriction"}
+
+
+def test_simple_functions_are_tried_beside_the_best_of_their_block():
+    """A loss that depends on M: to first order it served half as well as a function of both signals, and less than one of H; fitted,
+    it alone meets the noise and foretells what was left out."""
+
+    def place(block, first, evidence, factor=True):
+        term = types.SimpleNamespace(counts=(20, 1) if factor else (10, 6))
+        return Place(block, (first, "flux_rate"), evidence, 0.9, 0.1, 1.0, 0.2, term)
+
+    both, field, loss = place("coil", "field", 1650.0, False), place("coil", "field", 930.0), place("coil", "magnetization", 810.0)
+    weak, other = place("coil", "current", 600.0), place("hysteresis", "magnetization", 1500.0, False)
+    assert chosen_places([both, other, field, loss, weak]) == [field, loss, both, other]
+    good = place("coil", "field", 1600.0)
+    assert chosen_places([both, good, other, loss]) == [good, other]  # serves as well at once
+
+    def fitted(place, left):
+        return types.SimpleNamespace(place=place, result=types.SimpleNamespace(chi2_per_sample=left))
+
+    assert not _needless(both, [fitted(field, 9.0)]) and not _needless(loss, [fitted(field, 9.0)])
+    assert _needless(both, [fitted(field, 9.0), fitted(loss, 0.95)]) and not _needless(other, [fitted(loss, 0.95)])
+    assert _needless(other, [fitted(both, 0.95)])
 
 
 def test_evidence_knows_a_function_from_noise():
@@ -265,7 +287,6 @@ def test_the_prediction_is_less_sure_beyond_what_was_seen():
 
 def test_a_simple_function_is_tried_where_it_comes_some_way():
     """Alone where it serves nearly as well as one of two variables; beside that one in the leading block; else not."""
-    from fitting.learned import chosen_places
 
     def place(block, variables, evidence, factor=False):
         counts = (4, 1) if factor else (4,) * len(variables)
@@ -279,6 +300,6 @@ def test_a_simple_function_is_tried_where_it_comes_some_way():
         )
         return [p.variables for p in chosen_places([*places, place(block, both if factor else alone, share, factor)])]
 
-    assert chosen(94.0) == [alone] and chosen(85.0) == [alone, both] and chosen(70.0) == [both]
+    assert chosen(94.0) == [alone] and chosen(85.0) == chosen(45.0) == [alone, both] and chosen(30.0) == [both]
     assert chosen(85.0, factor=True) == [both, both]  # a factor counts as one of one
     assert chosen(85.0, "sensor") == [both, both] and chosen(95.0, "sensor") == [both, alone]
