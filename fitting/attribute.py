@@ -145,9 +145,9 @@ def settled(task, base, trial, excess, target: float = np.inf) -> Trial:
     return _gone_on(task, base, trial, excess, _further_starts(base, trial), MISFIT, target)
 
 
-def to_the_end(task, base, candidate, excess):
-    """A trial, settled."""
-    return settled(task, base, try_effect(task, base, candidate, excess), excess)
+def to_the_end(task, base, candidate, excess, target: float = np.inf):
+    """A trial, settled; one that cannot come near the `target` ends early."""
+    return settled(task, base, try_effect(task, base, candidate, excess, target), excess, target)
 
 
 def in_detail(task, base, trial, excess) -> Trial:

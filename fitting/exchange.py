@@ -14,6 +14,8 @@ from .attribute import (
     COMPANIONS,
     MIN_DROP,
     MISFIT,
+    MISFIT_TIE,
+    WEAK_TIE,
     Trial,
     chi2_of,
     credited,
@@ -102,8 +104,10 @@ def _exchanged(task, state, index, check=()) -> bool:
     trials = [Trial(best.candidate, state.current, 0.0, cost, True, best.explained_share, best.parameters)]
     near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
 
+    near_enough = (1 + MISFIT_TIE) * chi2_of(state.current) + 2 * WEAK_TIE[1]  # beyond it none is a rival
+
     def beside(t):
-        return lambda say: to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP)
+        return lambda say: to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP, near_enough)
 
     for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
         trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round

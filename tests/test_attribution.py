@@ -572,9 +572,9 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
     steps = [(best, [best], [best, rival, far], None), (trial("sensor_lag", 1.6, base=20.0), [], [], None)]
     tried = []
 
-    def fitted(task, rest, c, excess):
+    def fitted(task, rest, c, excess, target):
         tried.append(c.name)
-        assert rest.chi2_per_sample == 1.6
+        assert rest.chi2_per_sample == 1.6 and target == pytest.approx(1.1 * 1.6 * COUNT + 50)
         return dataclasses.replace(trial(c.name, ends, base=1.6), result=Result(ends))
 
     monkeypatch.setattr(fitting.exchange, "to_the_end", fitted)
