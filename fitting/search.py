@@ -48,7 +48,7 @@ FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked fo
 LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
 IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise
 FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further,
-WHOLE = 1.0, 0.9  # unless it ends at this chi2/N and takes that share of what they leave: another law seldom has just their form
+WHOLE = 1.0, 0.9  # unless it ends at this chi2/N and takes that share of a misfit: another law seldom has just their form
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7; check recordings
@@ -100,7 +100,7 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
             return state
         if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
             break
-        if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)) and not _whole(best):
+        if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best):
             if check and not _predicts_worse(state.current, best.result, foretell):
                 state.current, state.form, made_up = best.result, best.name, best.candidate
             break
@@ -197,9 +197,9 @@ def _needless(candidate, trials) -> bool:
     return candidate.name not in STRUCTURES and any(abs(candidate.z) < CLOSE * abs(t.candidate.z) for t in met)
 
 
-def _whole(best) -> bool:
-    """Whether an effect takes all that those before it leave, down to the noise."""
-    return best.result.chi2_per_sample < WHOLE[0] and best.explained_share > WHOLE[1]
+def _whole(current, best) -> bool:
+    """Whether an effect takes all that those before it leave, a clear misfit, down to the noise."""
+    return current.chi2_per_sample > MISFIT and best.result.chi2_per_sample < WHOLE[0] and best.explained_share > WHOLE[1]
 
 
 def _decides(current, best, excess) -> bool:

@@ -426,6 +426,13 @@ def test_where_one_effect_takes_most_two_must_meet_the_noise(monkeypatch):
     assert searched(monkeypatch, ends, follows | {"transport_delay": ("duffing_stiffness", 74.0, 1.7)}) == "second_eddy_path"
 
 
+@pytest.mark.parametrize(("before", "after", "whole"), [(1.5, 0.95, True), (1.2, 0.94, False), (1.5, 1.1, False), (2.9, 0.99, True)])
+def test_an_effect_is_more_than_the_form_of_a_law_where_it_takes_a_whole_misfit(before, after, whole):
+    """Little above the noise another law has that form soon enough."""
+    current = trial("transport_delay", before).result
+    assert fitting.search._whole(current, trial("delta_e", after, base=before)) is whole
+
+
 def test_what_the_form_of_a_law_leaves_promises_nothing():
     """A hundredth of a per cent of what was found is left by the law's form, however it scores."""
     base, after = (trial("excess_loss", x).result for x in (150.0, 2.1))
