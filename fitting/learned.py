@@ -32,6 +32,7 @@ SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in p
 WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned function leaves where the effect is the wrong name
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
+BASE_LOSSES = {("coil", "flux_rate"): "R_eddy", ("mechanics", "displacement_rate"): "xi"}
 GRID = 121
 BEYOND = 0.25  # of the range seen, shown on either side of it
 
@@ -183,15 +184,21 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
 def band(learned: Learned, *values):
     """The learned function and its standard deviation at some values of its variables, unit of the block's output.
 
-    Centred on the range seen: a constant is not told from the base. Beyond the range the deviation grows with the
-    distance as the slope of the prior does.
+    Centred on the range seen, for a constant is not told from the base; of a function times a rate whose loss the base has
+    (`_taken_up`) its mean at each rate. Beyond the range the deviation grows with the distance as the slope of the prior does.
     """
     term = learned.term
-    waves, outside = (np.asarray(x) for x in term.basis(*(np.asarray(v, float) for v in values), xp=np))
-    axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(term.low, term.high, strict=True)), indexing="ij")
-    middle = term.basis(*axes, xp=np)[0].reshape(len(waves), -1).mean(axis=1)
+    values = [np.asarray(v, float) for v in values]
+    waves, outside = (np.asarray(x) for x in term.basis(*values, xp=np))
     shape = waves.shape[1:]
-    rows = waves.reshape(len(waves), -1) - middle[:, None]
+    rows = waves.reshape(len(waves), -1)
+    if _taken_up(term):
+        along = np.linspace(float(term.low[0]), float(term.high[0]), 41)[:, None]
+        middle = term.basis(*np.broadcast_arrays(along, values[1].ravel()), xp=np)[0].mean(axis=1)
+    else:
+        axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(term.low, term.high, strict=True)), indexing="ij")
+        middle = term.basis(*axes, xp=np)[0].reshape(len(waves), -1).mean(axis=1)[:, None]
+    rows = rows - middle
     size = float(term.size)
     value = size * (np.array([float(c) for c in term.coefficients]) @ rows)
     variance = (
@@ -199,6 +206,11 @@ def band(learned: Learned, *values):
         + np.sum(outside.reshape(len(outside), -1) ** 2, axis=0) / learned.place.length**2
     )
     return value.reshape(shape), size * np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
+
+
+def _taken_up(term) -> str | None:
+    """The constant of the base that takes up the mean of a function times a rate: the eddy resistance, the damping."""
+    return BASE_LOSSES.get((term.place, *term.variables[1:])) if term.counts[1:] == (1,) else None
 
 
 @kept
@@ -277,7 +289,7 @@ def described(learned: Learned) -> dict:
     return {
         "variables": named(learned.place), "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
-        "left_out": list(learned.left_out), "bends_over": learned.place.length,
+        "mean_in": _taken_up(term), "left_out": list(learned.left_out), "bends_over": learned.place.length,
         "function": {"x": x.tolist(), "slices": slices},
         "boundaries": [
             {

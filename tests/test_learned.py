@@ -151,6 +151,10 @@ def test_simple_functions_are_tried_beside_the_best_of_their_block():
     assert chosen_places([both, other, field, loss, weak]) == [field, loss, both, other]
     good = place("coil", "field", 1600.0)
     assert chosen_places([both, good, other, loss]) == [good, other]  # serves as well at once
+    assert chosen_places([both, weak]) == [both]  # too far off
+    second = place("hysteresis", "field", 1450.0)
+    assert chosen_places([both, other, second]) == [both, second]  # beside the leading block only what serves nearly as well
+    assert chosen_places([both, other, place("hysteresis", "field", 1300.0)]) == [both, other]
 
     def fitted(place, left):
         return types.SimpleNamespace(place=place, result=types.SimpleNamespace(chi2_per_sample=left))
@@ -212,6 +216,24 @@ def test_the_band_widens_beyond_what_was_seen():
         ("sensor", None, None),
     ]
     assert content["seen"] == [[0.0, 2e4]] and len(content["function"]["x"]) == len(content["function"]["slices"][0]["low"])
+
+
+@pytest.mark.parametrize(("block", "rate"), [("coil", "flux_rate"), ("mechanics", "displacement_rate")])
+def test_the_band_of_a_loss_leaves_to_the_base_what_is_its_own(block, rate):
+    """M times dB/dt: of its constant part nothing is known, for that is the eddy resistance; how it bends is known well."""
+    deviation = prior_deviations((8,), 0.3)
+    values = 0.5 * deviation
+    term = LearnedTerm.null(block, ("magnetization", rate), [-6e5, -150.0], [6e5, 200.0], (8, 1), np.ones(8), 10.0, coefficients=values)
+    place = Place(block, term.variables, 100.0, 0.9, 0.2, 10.0, 0.1, term)
+    known = np.diag((0.02 * deviation) ** 2)
+    loose = known.copy()
+    loose[0, 0] = 50.0**2  # the first wave is the constant
+    m, at = np.linspace(-6e5, 6e5, 41), np.full(41, 120.0)
+    value, wide = band(Learned(place, term, None, loose, (5.0, 1.1), 0.9), m, at)
+    assert wide == pytest.approx(band(Learned(place, term, None, known, (5.0, 1.1), 0.9), m, at)[1], rel=1e-6)
+    assert value.mean() == pytest.approx(0.0, abs=1e-9) and np.ptp(value) > 10 * wide.max()
+    elsewhere = dataclasses.replace(term, place="sensor", variables=("magnetization", "reading_rate"))  # no constant of the base
+    assert band(Learned(place, elsewhere, None, loose, (5.0, 1.1), 0.9), m, at)[1].max() > 100
 
 
 class FieldKink(AbstractEffect):
@@ -283,23 +305,3 @@ def test_the_prediction_is_less_sure_beyond_what_was_seen():
     inside = prediction_interval(learned, 0.3 * np.sin(phase), 1 / 2500)[1]
     beyond = prediction_interval(learned, 0.8 * np.sin(phase), 1 / 2500)[1]
     assert beyond.max() > 5 * inside.max() > 0
-
-
-def test_a_simple_function_is_tried_where_it_comes_some_way():
-    """Alone where it serves nearly as well as one of two variables; beside that one in the leading block; else not."""
-
-    def place(block, variables, evidence, factor=False):
-        counts = (4, 1) if factor else (4,) * len(variables)
-        return Place(block, variables, evidence, 0.9, 0.5, 1.0, 0.1, types.SimpleNamespace(counts=counts))
-
-    both, alone = ("displacement", "displacement_rate"), ("displacement_rate",)
-
-    def chosen(share, block="mechanics", factor=False):
-        places = (
-            [place("mechanics", both, 100.0), place(block, both, 99.0)] if block != "mechanics" else [place(block, both, 100.0)]
-        )
-        return [p.variables for p in chosen_places([*places, place(block, both if factor else alone, share, factor)])]
-
-    assert chosen(94.0) == [alone] and chosen(85.0) == chosen(45.0) == [alone, both] and chosen(30.0) == [both]
-    assert chosen(85.0, factor=True) == [both, both]  # a factor counts as one of one
-    assert chosen(85.0, "sensor") == [both, both] and chosen(95.0, "sensor") == [both, alone]

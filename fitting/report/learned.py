@@ -106,8 +106,9 @@ def learned_function(unknown, stem: str = "learned"):
             axes.set(xlabel=f"{unknown['variables'][0].replace('_', ' ')} / {per(label)}", title=_slice(unknown, s))
             if k == 0:
                 axes.set_ylabel(f"added at the {unknown['block']} / {per(output)}")
+        less = f"what {unknown['mean_in']} takes up (its mean at each value of the factor)" if unknown.get("mean_in") else "its mean"
         caption = (
-            f"Learned function: what the {unknown['block']} adds beside the model, with its 95 % interval, less its mean. Grey: beyond what the recordings "
+            f"Learned function: what the {unknown['block']} adds beside the model, with its 95 % interval, less {less}. Grey: beyond what the recordings "
             "reached, where it is held and its interval widens."
         )
         middle = slices[0]

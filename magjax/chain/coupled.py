@@ -4,32 +4,26 @@ With k the loss of the coil, X = H + M and a = mu0 k / h, one step of the second
     a (3/2 X1 - 2 X0 + 1/2 X-1) + H1 = applied field 1,                         p = 1 + 3a/2,  q = 3a/2
 and of the trapezoid rule
     a (X1 - X0) + (H1 + H0)/2 = (applied 0 + applied 1)/2,                      p = 1/2 + a,   q = a.
-Both ask for p v + q M(v) = rhs: strictly monotone and piecewise quadratic in the field v. Corners that the step wipes
-out follow from stored values, the cell by a search over the levels, the rest from a quadratic in closed form; where a
-derivative is asked for, one Newton polish with a frozen slope, which adds nothing to the value, makes it exact.
+Both ask for p v + q M(v) = rhs, strictly monotone in the field v: `closed_form`, and `newton` with what effects add to it.
 The backward formula does not ring where the time constant mu0 k (1 + dM/dH) is far below the step, as at low frequency,
 and turns into M(applied field) for k = 0; the trapezoid has the smaller error constant where the loop is resolved.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.custom_derivatives import SymbolicZero
-from jax.lax import stop_gradient
 
 from ..constants import MU0
 from ..effects.base import Trial
 from ..errors import ConfigurationError
-from ..preisach.everett import take
 from ..preisach.memory import Memory, apply_field, branch_magnetization
+from .closed_form import solve_branch
+from .newton import LOSSES, Posed, extra_of, extra_terms, solve_with_effects, trial_of
 
 SCHEMES = ("bdf2", "trapezoid")
-LOSSES = ("source", "coil")  # blocks whose effects take from the applied field
-CLOSE_ENOUGH = 1e-12  # of half the plane; the polish squares what is left
-MOST_STEPS = 100  # each halves the bracket or the step
 
 
 class _Carry(eqx.Module):
@@ -40,140 +34,7 @@ class _Carry(eqx.Module):
     applied0: jax.Array
     states: tuple
     marks: tuple  # states of effects at the last end of a period
-
-
-def solve_frozen(table, memory: Memory, p, q, rhs):
-    """The field v with p v + q M(v) = rhs, without a derivative: (v, M(v), rising, kept)."""
-    table, memory, p, q, rhs = stop_gradient((table, memory, p, q, rhs))
-    rising = rhs >= p * memory.field + q * memory.magnetization
-    up = jnp.sum(p * memory.maxima + q * memory.m_maxima > rhs)
-    down = jnp.sum(p * memory.minima + q * memory.m_minima < rhs)
-    kept = jnp.where(rising, up, down)
-    v, m = _locate(table, memory.select(table, rising, kept), p, q, rhs)
-    return v, m, rising, kept
-
-
-@jax.custom_jvp
-def solve_branch(table, memory: Memory, p, q, rhs):
-    """As `solve_frozen`, with exact derivatives of v and M. The polish that makes them is done where one is asked for."""
-    return solve_frozen(table, memory, p, q, rhs)
-
-
-def _polished(given, tangents):
-    v, m, rising, kept = solve_frozen(*given)
-    leaves, tree = jax.tree.flatten(given)
-    directions = tree.flatten_up_to(tangents)
-    moving = [k for k, d in enumerate(directions) if type(d) is not SymbolicZero]
-
-    def there(*moved):
-        at = list(leaves)
-        for k, leaf in zip(moving, moved, strict=True):
-            at[k] = leaf
-        table, memory, p, q, rhs = jax.tree.unflatten(tree, at)
-        return polish(table, memory, rising, kept, v, p, q, rhs)
-
-    (v, m), (dv, dm) = jax.jvp(there, [leaves[k] for k in moving], [directions[k] for k in moving])
-    none = [np.zeros(x.shape, jax.dtypes.float0) for x in (rising, kept)]
-    return (v, m, rising, kept), (dv, dm, *none)
-
-
-solve_branch.defjvp(_polished, symbolic_zeros=True)
-
-
-def polish(table, memory, rising, kept, v, p, q, rhs, extra=0.0, extra_slope=0.0):
-    """One Newton step with frozen slope from a solution v of p v + q M(v) + extra = rhs: its value stays, to
-    rounding, and every derivative becomes that of the implicit function."""
-    _, _, threshold, m_there = memory.select(table, rising, kept)
-    m_slope = _slope(*stop_gradient((table, v, threshold, rising)))
-    m = branch_magnetization(table, rising, threshold, m_there, v)
-    change = -((p * v + q * m - rhs) + extra) / stop_gradient(p + q * m_slope + extra_slope)
-    return v + change, m + m_slope * change
-
-
-def _level_values(table, cell, fixed, share, rising):
-    """T on the branch at both ends of a cell: T(level, threshold) rising, T(threshold, level) falling."""
-    width = table.cells + 1
-    flat = table.values.ravel()
-    here = jnp.where(rising, cell * width + fixed, fixed * width + cell)
-    along, across = jnp.where(rising, width, 1), jnp.where(rising, 1, width)
-    bend = share * (1 - share) * take(table.diagonal, fixed)
-    first = (1 - share) * take(flat, here) + share * take(flat, here + across) - bend
-    second = (1 - share) * take(flat, here + along) + share * take(flat, here + along + across) - bend
-    return first, second
-
-
-def _slope(table, field, threshold, rising):
-    """dM/dv on a branch: 2 dT/dalpha rising, -2 dT/dbeta falling; zero outside the plane."""
-    inside = (field > table.low) & (field < table.low + table.cells * table.step)
-    cell, local = table.locate(field)
-    first, second = _level_values(table, cell, *table.locate(threshold), rising)
-    slope = (second - first) + (2 * local - 1) * take(table.diagonal, cell)
-    return jnp.where(inside, jnp.where(rising, 2.0, -2.0) * slope / table.step, 0.0)
-
-
-def _locate(table, branch, p, q, rhs):
-    """The solution and M there, all inputs frozen: a search over the levels, then the quadratic of one cell."""
-    rising, _, threshold, m_there = branch
-    L, width = table.cells, table.cells + 1
-    fixed, share = table.locate(threshold)
-    sign = jnp.where(rising, 1.0, -1.0)
-    flat = table.values.ravel()
-    base = jnp.where(rising, fixed, fixed * width)
-    along, across = jnp.where(rising, width, 1), jnp.where(rising, 1, width)
-    constant = p * table.low + q * (m_there - 2 * sign * share * (1 - share) * take(table.diagonal, fixed)) - rhs
-
-    def not_above(level):
-        at = base + level * along
-        T = (1 - share) * take(flat, at) + share * take(flat, at + across)
-        value = constant + p * level * table.step + 2 * q * sign * T
-        # rising the branch runs over the levels above the threshold, falling over those below it
-        return jnp.where(rising, (level <= fixed) | (value <= 0), (value <= 0) & (level <= fixed))
-
-    # the last level not above the solution, two levels at once in ever finer strides: where one or three are tried, the
-    # compiler's loops are two to three times slower
-    cell = 0
-    for stride in _strides(L):
-        levels = cell + stride * jnp.arange(1, 3)
-        cell = cell + stride * jnp.sum(not_above(jnp.minimum(levels, L)) & (levels < L))
-
-    # in the cell T = first + (second - first - D) z + D z^2; go from the anchor by the distance rho that is left
-    first, second = _level_values(table, cell, fixed, share, rising)
-    D = take(table.diagonal, cell)
-    anchor = jnp.where(cell == fixed, share, jnp.where(rising, 0.0, 1.0))
-    T_anchor = first + (second - first - D) * anchor + D * anchor**2
-    slope = sign * (second - first - D + 2 * D * anchor)
-    rho = sign * (rhs - p * (table.low + (cell + anchor) * table.step) - q * (m_there + 2 * sign * T_anchor))
-    rho = jnp.maximum(rho, 0.0)
-    b = p * table.step + 2 * q * slope
-    z = anchor + sign * 2 * rho / (b + jnp.sqrt(b * b + 8 * q * D * rho))
-    v = table.low + (cell + z) * table.step
-    m = m_there + 2 * sign * (first + (second - first - D + D * z) * z)
-    # outside the plane every relay is saturated and the equation linear
-    m_top = table.offset + table.total
-    above = p * (table.low + L * table.step) + q * m_top < rhs
-    below = p * table.low + q * table.lowest > rhs
-    m = jnp.where(above, m_top, jnp.where(below, table.lowest, m))
-    return jnp.where(above | below, (rhs - q * m) / p, v), m
-
-
-def _strides(cells):
-    """Strides, coarse to fine, so that two levels tried at each end in one cell of so many."""
-    strides = [1]
-    while 3 * strides[-1] < cells:
-        strides.append(3 * strides[-1])
-    return strides[::-1]
-
-
-def _extra_terms(effects, states, actuator, trial, p, q):
-    """What the effects add to p v + q M = rhs, and the same split for the caller: (sum, H shift, added M)."""
-    shift = loss = added = jnp.zeros_like(trial.field)
-    for effect, state in zip(effects, states, strict=True):
-        added = added + effect.magnetization(trial, state, actuator)
-        if effect.block in LOSSES:
-            loss = loss + effect.field_shift(trial, state, actuator)
-        else:
-            shift = shift + effect.field_shift(trial, state, actuator)
-    return p * shift + q * added + loss, shift, added
+    before: tuple  # relay field and M a step earlier, where effects act in the step
 
 
 class March(NamedTuple):
@@ -201,7 +62,9 @@ def march_of(actuator, applied, current, h, memory: Memory, scheme: str, period:
     def advance(c: _Carry, drive):
         rhs, trial_at = law.posed(c, drive)
         if law.effects:
-            v, m, rising, kept, extra = _solve_with_effects(table, c, law.effects, actuator, trial_at, p, q, rhs)
+            posed = Posed(table, c, law.effects, actuator, drive[1], h, p, q, rhs)
+            v, m, rising, kept = solve_with_effects(scheme, posed)
+            extra = extra_of(scheme, posed, v, m)
         else:
             v, m, rising, kept = solve_branch(table, c.memory, p, q, rhs)
             extra = (0.0, 0.0, 0.0)
@@ -209,7 +72,10 @@ def march_of(actuator, applied, current, h, memory: Memory, scheme: str, period:
         if law.effects:  # the relays' own M at that field, so that a step that did not settle shows
             own, _, threshold, m_there = c.memory.branch(table, v)
             residual = residual + (branch_magnetization(table, own, threshold, m_there, v) - m)
-        return law.after(c, drive, trial_at, v, m, extra, c.memory.move(rising, kept, v, m), residual)
+        then, row = law.after(c, drive, trial_at, v, m, extra, c.memory.move(rising, kept, v, m), residual)
+        if law.effects:
+            then = dataclasses.replace(then, before=(c.memory.field, c.memory.magnetization))
+        return then, row
 
     return March(carry, first, advance)
 
@@ -217,7 +83,7 @@ def march_of(actuator, applied, current, h, memory: Memory, scheme: str, period:
 class _Law(NamedTuple):
     """One step of (4) apart from how it is solved: p v + q M + extra = rhs.
 
-    `posed(carry, drive)`: (rhs, trial_at); `extra(states, trial)`: see `_extra_terms`; `after(carry, drive, trial_at, v, m,
+    `posed(carry, drive)`: (rhs, trial_at); `extra(states, trial)`: see `extra_terms`; `after(carry, drive, trial_at, v, m,
     extra, memory, residual)`: (next carry, row).
     """
 
@@ -243,14 +109,12 @@ def _law(actuator, h, scheme, period) -> _Law:
             rhs = rhs - (p * given[0] + q * given[1] + given[2])
 
         def trial_at(v, m):
-            X1 = v + m
-            change = (1.5 * X1 - 2 * c.X0 + 0.5 * c.X_before) if bdf else X1 - c.X0
-            return Trial(v, m, MU0 * change / h, (v - c.memory.field) / h, current1, h)
+            return trial_of(scheme, c, current1, h, v, m)
 
         return rhs, trial_at
 
     def extra(states, trial):
-        return _extra_terms(effects, states, actuator, trial, p, q)
+        return extra_terms(effects, states, actuator, trial, p, q)
 
     def after(c, drive, trial_at, v, m, added, memory, residual):
         applied1, _, end, *given = drive
@@ -260,7 +124,7 @@ def _law(actuator, h, scheme, period) -> _Law:
         if given:
             H, M = H + given[0], M + given[1]
         states, marks = _settle(effects, states, c.marks, end, period * h)
-        return _Carry(memory, H + M, c.X0, H, applied1, states, marks), (H, M, v, residual)
+        return _Carry(memory, H + M, c.X0, H, applied1, states, marks, c.before), (H, M, v, residual)
 
     return _Law(effects, p, q, extra, posed, after)
 
@@ -274,7 +138,8 @@ def _at_rest(law: _Law, table, actuator, applied, current, h, memory: Memory):
     _, shift, added = law.extra(states, rest)
     H, M = memory.field + shift, memory.magnetization + added
     X = H + memory.magnetization + added
-    return _Carry(memory, X, X, H, applied, states, states), (H, M, memory.field, zero)
+    before = (memory.field, memory.magnetization) if law.effects else ()
+    return _Carry(memory, X, X, H, applied, states, states, before), (H, M, memory.field, zero)
 
 
 def run_march(march: March, applied, current, disturbance=None, period: int = 0):
@@ -364,57 +229,3 @@ def disturbance_of(effect, actuator, field, magnetization, current, h, period: i
     ends = _ends_of_periods(len(field), period)
     rows = jax.lax.scan(advance, (state, state, X[0], X[0], field[0]), (field[1:], magnetization[1:], current[1:], X[1:], ends))[1]
     return tuple(jnp.concatenate([zero[None], r]) for r in rows)
-
-
-def _solve_with_effects(table, c, effects, actuator, trial_at, p, q, rhs):
-    """Safeguarded Newton on the whole equation, then the closed form with the effects' term frozen.
-
-    The closed form on rhs - extra has the same bits as the base where every effect is at its null.
-    """
-
-    def extra_at(v, m):
-        return _extra_terms(effects, c.states, actuator, trial_at(v, m), p, q)
-
-    frozen_table, frozen_c, pf, qf, rf = stop_gradient((table, c, p, q, rhs))
-    frozen_effects, frozen_actuator = stop_gradient((effects, actuator))
-
-    def excess(v):
-        rising, _, threshold, m_there = frozen_c.memory.branch(frozen_table, v)
-        m = branch_magnetization(frozen_table, rising, threshold, m_there, v)
-        extra = _extra_terms(frozen_effects, frozen_c.states, frozen_actuator, stop_gradient_trial(trial_at, v, m), pf, qf)[0]
-        return pf * v + qf * m + extra - rf, extra
-
-    v0, *_ = solve_frozen(frozen_table, frozen_c.memory, pf, qf, rf)
-    reach = 0.5 * frozen_table.step * frozen_table.cells
-
-    def refine(bracket):
-        v, lo, hi, last, number = bracket
-        (value, _), (slope, _) = jax.jvp(excess, (v,), (jnp.ones_like(v),))
-        lo, hi = jnp.where(value <= 0, v, lo), jnp.where(value > 0, v, hi)
-        newton = v - value / jnp.where(slope > 0, slope, pf)
-        # by no more than half the last step, or it may go to and fro over a steep place for ever
-        inside = (newton > lo) & (newton < hi) & (slope > 0) & (jnp.abs(newton - v) <= 0.5 * last)
-        new = jnp.where(value == 0, v, jnp.where(inside, newton, 0.5 * (lo + hi)))
-        return new, lo, hi, jnp.abs(new - v), number + 1
-
-    def unsettled(bracket):
-        return (bracket[3] > CLOSE_ENOUGH * reach) & (bracket[4] < MOST_STEPS)
-
-    v, *_ = jax.lax.while_loop(unsettled, refine, (v0, v0 - reach, v0 + reach, reach, 0))
-    v = stop_gradient(v)
-    frozen_extra = stop_gradient(excess(v)[1])
-    v, m, rising, kept = solve_frozen(frozen_table, frozen_c.memory, pf, qf, rf - frozen_extra)
-    # live polish: the effects' term with its own derivative
-    extra_slope = jax.jvp(excess, (v,), (jnp.ones_like(v),))[1][1]
-    _, _, threshold, m_there = c.memory.select(table, rising, kept)
-    live_m = branch_magnetization(table, rising, threshold, m_there, v)
-    live_extra = extra_at(v, live_m)[0]
-    v, m = polish(table, c.memory, rising, kept, v, p, q, rhs, live_extra, extra_slope)
-    return v, m, rising, kept, extra_at(v, m)
-
-
-def stop_gradient_trial(trial_at, v, m):
-    """A trial whose history carries no derivative, at a field and magnetization that may."""
-    fixed = stop_gradient(trial_at(stop_gradient(v), stop_gradient(m)))
-    moved = trial_at(v, m)
-    return Trial(*(f + (g - stop_gradient(g)) for f, g in zip(fixed, moved, strict=True)))

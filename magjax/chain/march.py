@@ -11,12 +11,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jax.lax import stop_gradient
 
 from ..preisach.memory import Memory, branch_magnetization
-from .coupled import _at_rest, _ends_of_periods, _law, march_of, run_march, stop_gradient_trial
+from .closed_form import pushed, unmoved
+from .coupled import _at_rest, _ends_of_periods, _law, march_of, run_march
+from .newton import stop_gradient_trial
 
 
 def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid", disturbance=None, period: int = 0):
@@ -43,18 +43,11 @@ _marched = jax.custom_jvp(_march_all, nondiff_argnums=(0, 1))
 def _derived(scheme, period, given, tangents):
     """The march and its change: that of its `_replay`."""
     marched = _marched(scheme, period, *given)
-    leaves, tree = jax.tree.flatten(given)
-    directions = tree.flatten_up_to(tangents)
-    moving = [k for k, d in enumerate(directions) if type(d) is not SymbolicZero]
 
-    def there(*moved):
-        at = list(leaves)
-        for k, leaf in zip(moving, moved, strict=True):
-            at[k] = leaf
-        return _replay(scheme, period, stop_gradient(marched[2]), *jax.tree.unflatten(tree, at))
+    def there(*given):
+        return _replay(scheme, period, stop_gradient(marched[2]), *given)
 
-    change = jax.jvp(there, [leaves[k] for k in moving], [directions[k] for k in moving])[1]
-    return marched, (*change, np.zeros(marched[-1].shape, jax.dtypes.float0))
+    return marched, (*pushed(there, given, tangents)[1], unmoved(marched[-1]))
 
 
 _marched.defjvp(_derived, symbolic_zeros=True)

@@ -20,7 +20,9 @@ from ..constants import MU0
 from ..effects.base import Trial
 from ..linear import inverse_of
 from ..preisach.memory import apply_field, branch_magnetization
-from .coupled import March, _extra_terms, _settle, _slope, run_march
+from .closed_form import slope_of
+from .coupled import March, _settle, run_march
+from .newton import extra_terms
 
 CLOSE_ENOUGH = 1e-10  # A/m relative to half the plane
 MOST_STEPS = 60
@@ -74,7 +76,7 @@ def march_of_shells(actuator, share, count: int, applied, current, h, memory, sc
     zero = jnp.zeros_like(memory.field)
     rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
     states = _of_every_shell(tuple(e.start(rest, actuator) for e in effects), count)
-    _, shift, added = _extra_terms(effects, states, actuator, rest, 0.0, 0.0)
+    _, shift, added = extra_terms(effects, states, actuator, rest, 0.0, 0.0)
     first = memory.field + shift
     X = first + memory.magnetization + added
     carry = _Carry(memory, X, X, first, applied, states, states)
@@ -95,7 +97,7 @@ def march_of_shells(actuator, share, count: int, applied, current, h, memory, sc
 
         v, m, rising, kept = _solve(table, c, effects, actuator, trial_of, current1, p0, Q, rhs)
         trial = trial_of(c, current1, v, m)
-        loss, shift, added = _extra_terms(effects, c.states, actuator, trial, 0.0, 0.0)
+        loss, shift, added = extra_terms(effects, c.states, actuator, trial, 0.0, 0.0)
         H, M = v + shift, m + added
         residual = p0 * H + loss + Q @ (H + M) - rhs
         residual = residual + (_relays(table, c.memory, v)[0] - m)  # the relays' own M there: a step that did not settle shows
@@ -120,7 +122,7 @@ def _relays(table, memory, v):
 
     def one(memory, v):
         rising, kept, threshold, m_there = memory.branch(table, v)
-        return branch_magnetization(table, rising, threshold, m_there, v), _slope(table, v, threshold, rising), rising, kept
+        return branch_magnetization(table, rising, threshold, m_there, v), slope_of(table, v, threshold, rising), rising, kept
 
     return jax.vmap(one)(memory, v)
 
@@ -134,7 +136,7 @@ def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
         m, slope, *_ = _relays(table, c.memory, v)
 
         def terms(v, m):
-            return _extra_terms(effects, c.states, actuator, trial_of(c, current, v, m), 0.0, 0.0)
+            return extra_terms(effects, c.states, actuator, trial_of(c, current, v, m), 0.0, 0.0)
 
         (loss, shift, added), (d_loss, d_shift, d_added) = jax.jvp(terms, (v, m), (jnp.ones_like(v), slope))
         F = p0 * (v + shift) + loss + Q @ (v + shift + m + added) - rhs
@@ -167,6 +169,6 @@ def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
         return branch_magnetization(table, rising, threshold, m_there, v)
 
     m = jax.vmap(live)(c.memory, rising, kept, v)
-    loss, shift, added = _extra_terms(effects, c.states, actuator, trial_of(c, current, v, m), 0.0, 0.0)
+    loss, shift, added = extra_terms(effects, c.states, actuator, trial_of(c, current, v, m), 0.0, 0.0)
     change = -inverse @ (p0 * (v + shift) + loss + Q @ (v + shift + m + added) - rhs)
     return v + change, m + slope * change, rising, kept
