@@ -9,20 +9,32 @@ from magjax.simulate import simulate
 from .model import Predictor, predicted_lines
 from .spectra import evaluate_lines, reduce_recording
 
+SAMPLES, HARMONICS, PERIODS = 500, 40, 4  # of a prediction: points a period, lines, periods simulated
 
-def prediction(actuator, recording, bench):
-    """(predicted, measured, noise rms) over the recording's samples. Periodic drives settle first; others start at rest."""
-    measured = np.asarray(recording.channels[bench.output], float)
-    if recording.frequency() is None:
-        signals = simulate(actuator, recording.channels[bench.drive], recording.dt, outside="saturate")  # told by `beyond_plane`
-        predicted = np.asarray(signals.reading)
-        return predicted, _levelled(measured, predicted, recording, bench), None
-    s = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
-    corners = int(4 * np.ceil(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) / 4))
-    lines = np.asarray(predicted_lines(Predictor.build([s], 500, 40, 4, corners), actuator))[0]
-    phases = np.arange(s.samples) * s.dt * s.frequency
-    predicted = evaluate_lines(lines, phases)
-    return predicted, _levelled(measured[: s.samples], predicted, recording, bench), s.noise_rms
+
+def predicted_periods(actuator, spectra) -> np.ndarray:
+    """Fourier coefficients of the settled reading on the drives of some spectra, (spectra, HARMONICS + 1)."""
+    turns = max(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) for s in spectra)
+    predictor = Predictor.build(spectra, SAMPLES, HARMONICS, PERIODS, int(4 * np.ceil(turns / 4)), apart=False)
+    found = [np.asarray(predicted_lines(part, actuator))[: len(places)] for part, places in predictor.batches()]
+    return np.concatenate(found)[np.asarray(predictor.index)]
+
+
+def predictions(actuator, recordings, bench) -> list:
+    """(predicted, measured, noise rms) over the samples of each recording. Periodic drives settle first; others start at rest."""
+    found = {}
+    for k, recording in enumerate(recordings):
+        if recording.frequency() is None:
+            drive = recording.channels[bench.drive]
+            signals = simulate(actuator, drive, recording.dt, outside="saturate")  # told by `beyond_plane`
+            found[k] = np.asarray(signals.reading), recording.channels[bench.output], None
+    periodic = [k for k in range(len(recordings)) if k not in found]
+    spectra = [reduce_recording(recordings[k], bench.drive, bench.output, columns=bench.columns) for k in periodic]
+    for k, s, lines in zip(periodic, spectra, predicted_periods(actuator, spectra) if spectra else (), strict=True):
+        phases = np.arange(s.samples) * s.dt * s.frequency
+        found[k] = evaluate_lines(lines, phases), recordings[k].channels[bench.output][: s.samples], s.noise_rms
+    rows = [(recordings[k], *found[k]) for k in range(len(recordings))]
+    return [(predicted, _levelled(np.asarray(y, float), predicted, r, bench), noise) for r, predicted, y, noise in rows]
 
 
 def _levelled(measured, predicted, recording, bench):
@@ -44,14 +56,13 @@ def beyond_plane(actuator, recording, bench) -> float:
 def check_errors(before, after, recordings, bench, cleaned=None) -> list[dict]:
     """rms error on each check recording before and after the repair; `cleaned`: what the repaired model is held against,
     the recordings without the drift, heat or hum that it names."""
-    unit = si_unit(bench.output)
+    unit, cleaned = si_unit(bench.output), recordings if cleaned is None else cleaned
+    first = predictions(before, recordings, bench)
+    last = first if after is before and cleaned is recordings else predictions(after, cleaned, bench)
     rows = []
-    for recording, clean in zip(recordings, recordings if cleaned is None else cleaned, strict=True):
-        errors = []
-        noise = None
-        for actuator, reading in ((before, recording), (after, clean)):
-            predicted, measured, noise = prediction(actuator, reading, bench)
-            errors.append(float(np.sqrt(np.mean((predicted - measured) ** 2))))
+    for recording, *found in zip(recordings, first, last, strict=True):
+        errors = [float(np.sqrt(np.mean((predicted - measured) ** 2))) for predicted, measured, _ in found]
+        noise = found[1][2]
         rows.append(
             {"file": recording.origin.get("file", recording.name), "channel": bench.output, "unit": unit,
              "rms_before": errors[0], "rms_after": errors[1], "noise_rms": noise if noise is not None else 0.0,

@@ -8,8 +8,11 @@ lets the level of M depend on a recording's highest and lowest field without ask
 import dataclasses
 import functools
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csc_array, csr_array, hstack, vstack
 
 R_EXPONENT = 1.6
 TAIL = 0.5
@@ -23,11 +26,48 @@ def on_device(values):
     return jax.device_put(values if values.dtype.kind in "fc" else values.astype(float))
 
 
+class Hats(eqx.Module):
+    """What every unknown of a density puts into which cell of a plane, at a total mass of 1.
+
+    `shares`: (entries,), sorted by the `unknowns` that they belong to; `places`: cells, row by row of a (`size`, `size`) plane.
+    """
+
+    shares: jax.Array
+    places: jax.Array
+    unknowns: jax.Array
+    size: int = eqx.field(static=True)
+
+    def masses(self, x):
+        """Masses of the unknowns x, (size, size)."""
+        if isinstance(x, np.ndarray):
+            shares, places, unknowns = (np.asarray(k) for k in (self.shares, self.places, self.unknowns))
+            return np.bincount(places, shares * x[unknowns], self.size**2).reshape(self.size, self.size)
+        flat = jnp.zeros(self.size**2).at[self.places].add(self.shares * x[self.unknowns])
+        return flat.reshape(self.size, self.size)
+
+    def each(self, first: int) -> np.ndarray:
+        """Masses of `COLUMNS` unknowns from number `first` on, none for those that there are not, (COLUMNS, size, size)."""
+        shares, places, unknowns = (np.asarray(k) for k in (self.shares, self.places, self.unknowns))
+        mine = slice(*np.searchsorted(unknowns, (first, first + COLUMNS)))
+        cubes = np.zeros((COLUMNS, self.size**2))
+        cubes[unknowns[mine] - first, places[mine]] = shares[mine]
+        return cubes.reshape(COLUMNS, self.size, self.size)
+
+
+def everett_values(masses: np.ndarray) -> np.ndarray:
+    """Everett values at the levels, as `magjax.preisach.everett` has them, of masses (..., L, L): (..., L + 1, L + 1)."""
+    L = masses.shape[-1]
+    values, k = np.zeros((*masses.shape[:-2], L + 1, L + 1)), np.arange(L)
+    values[..., 1:, :L] = np.cumsum(np.cumsum(masses, axis=-2)[..., ::-1], axis=-1)[..., ::-1]
+    values[..., k, k + 1] = masses[..., k, k]
+    return values
+
+
 @dataclasses.dataclass(frozen=True)
 class DensityBasis:
     """masses = total * (cells @ x) on an (L+2) x (L+2) plane whose column 0 and last row hold the once-switching relays.
 
-    `low`, `high`: range of that plane, A/m; `cells`: ((L+2)^2, unknowns), unit-free; `penalties`: one matrix of
+    `low`, `high`: range of that plane, A/m; `cells`: sparse, ((L+2)^2, unknowns), unit-free; `penalties`: one sparse matrix of
     second differences per family (along s, along r, along the once-switching column); `total`: A/m;
     `flat`: the unknowns of a uniform density of mass `total`.
     """
@@ -35,8 +75,8 @@ class DensityBasis:
     low: float
     high: float
     size: int
-    cells: np.ndarray
-    penalties: tuple[np.ndarray, ...]
+    cells: csc_array
+    penalties: tuple[csr_array, ...]
     total: float
     flat: np.ndarray
     knots_s: int
@@ -44,25 +84,16 @@ class DensityBasis:
     held: np.ndarray | None = None  # (size, size), A/m: masses that are there beside them, and stay
 
     @functools.cached_property
-    def tables(self) -> np.ndarray:
-        """Everett values of every hat at total mass 1, as `magjax.preisach.everett` has them, (unknowns, size + 1, size + 1)."""
-        return np.concatenate(self.placed[1])[: self.unknowns]
+    def hats(self) -> Hats:
+        """The unknowns as programs and `Layout` have them."""
+        entries = self.cells.tocsc().tocoo()
+        places, unknowns = (jax.device_put(k.astype(np.int32)) for k in entries.coords)
+        return Hats(on_device(entries.data), places, unknowns, self.size)
 
     @functools.cached_property
-    def placed(self) -> tuple:
-        """Masses and Everett values of the hats, `COLUMNS` at a time and the last filled up with none, and penalties as JAX
-        arrays: every fit on this basis shares them."""
-        L, parts = self.size, ([], [])
-        for first in range(0, self.unknowns, COLUMNS):
-            some = self.cells[:, first : first + COLUMNS].T.reshape(-1, L, L)
-            cubes, values = np.zeros((COLUMNS, L, L)), np.zeros((COLUMNS, L + 1, L + 1))
-            cubes[: len(some)] = some
-            values[:, 1:, :L] = np.cumsum(np.cumsum(cubes, axis=1)[:, :, ::-1], axis=2)[:, :, ::-1]
-            k = np.arange(L)
-            values[:, k, k + 1] = cubes[:, k, k]
-            for part, held in zip(parts, (cubes, values), strict=True):
-                part.append(on_device(held))
-        return *map(tuple, parts), tuple(on_device(D) for D in self.penalties)
+    def tables(self) -> tuple[jax.Array, ...]:
+        """Everett values of the unknowns, `COLUMNS` at a time, (COLUMNS, levels, levels): every fit on this basis shares them."""
+        return tuple(on_device(everett_values(self.hats.each(k))) for k in range(0, self.unknowns, COLUMNS))
 
     @property
     def unknowns(self) -> int:
@@ -101,32 +132,32 @@ def hat_basis(
     even = np.linspace(-1, 1, knots_s)
     s_knots = 0.5 * (low + high) + 0.5 * (high - low) * np.sign(even) * np.abs(even) ** crowd
     r_knots = 0.5 * (high - low) * np.linspace(0, 1, knots_r) ** (R_EXPONENT * crowd**0.5)
-    hats_s, hats_r = _hats(s[inside], s_knots), _hats(r[inside], r_knots)
     row, column = (k[inside] // refine for k in np.indices(s.shape))
     cell = (row + 1) * size + (column + 1)
-    number, columns = {}, []
-    for a in range(knots_s):
-        for b in range(knots_r):
-            value = hats_s[:, a] * hats_r[:, b] * weight[inside]
-            mass = np.bincount(cell, value, size * size)
-            if mass.sum() > 1e-3:
-                number[a, b] = len(columns)
-                columns.append(mass)
-    area = sum(c.sum() for c in columns)
-    columns = [c / area for c in columns]
-    main = len(columns)
+    pairs = [
+        (weight[inside] * share_s * share_r, (cell, at_s * knots_r + at_r))
+        for at_s, share_s in _neighbours(s[inside], s_knots)
+        for at_r, share_r in _neighbours(r[inside], r_knots)
+    ]
+    shares, places = np.concatenate([v for v, _ in pairs]), np.concatenate([at for _, at in pairs], axis=1)
+    every = csc_array((shares, places), (size * size, knots_s * knots_r))  # of every pair of knots
+    there = np.flatnonzero(every.sum(axis=0) > 1e-3)
+    number = {divmod(int(pair), knots_r): k for k, pair in enumerate(there)}
+    every = every[:, there]
+    area, main = every.sum(), len(there)
+    columns = [every / area]
     once_knots = np.linspace(low, high, max(6, knots_s // 2))
     once = _hats(low + step * (np.arange(level) + 0.5), once_knots)
     for place in ((slice(1, -1), 0), (-1, slice(1, -1))):
         for k in range(once.shape[1]):
             mass = np.zeros((size, size))
             mass[place] = once[:, k] / level
-            columns.append(mass.ravel())
-    once_end = len(columns)
+            columns.append(csc_array(mass.reshape(-1, 1)))
+    once_end = main + len(columns) - 1
     for k in range(knots_s if reversible else 0):
         on_diagonal = np.diag(_hats(low + step * (np.arange(level) + 0.5), s_knots)[:, k] / level)
-        columns.append(np.pad(on_diagonal, 1).ravel())
-    cells = np.stack(columns, axis=1)
+        columns.append(csc_array(np.pad(on_diagonal, 1).reshape(-1, 1)))
+    cells = hstack(columns, format="csc")
     penalties = [
         _differences(
             [[number.get((a + d, b)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]
@@ -134,14 +165,15 @@ def hat_basis(
         _differences(
             [[number.get((a, b + d)) for d in (-1, 0, 1)] for a in range(knots_s) for b in range(knots_r)], cells.shape[1]
         ),
-        np.concatenate(
+        vstack(
             [
                 _differences(_triples(main, once.shape[1]) + _triples(main + once.shape[1], once.shape[1]), cells.shape[1]),
                 RIDGE
                 * _continuation(
                     low, high, once_knots, s_knots, r_knots, number, main, refine**2 * level / (area * step), cells.shape[1]
                 ),
-            ]
+            ],
+            format="csr",
         ),
     ]
     if reversible:
@@ -167,7 +199,14 @@ def _continuation(low, high, once_knots, s_knots, r_knots, number, main, scale, 
             for (a, b), j in number.items():
                 row[j] = -TAIL * distance[k] * scale * hats_s[k, a] * hats_r[k, b]
             rows.append(row)
-    return np.stack(rows)
+    return csr_array(np.stack(rows))
+
+
+def _neighbours(x, knots):
+    """The two knots about each x within them, as (numbers, shares of the linear hats there)."""
+    first = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
+    share = np.clip((x - knots[first]) / (knots[first + 1] - knots[first]), 0.0, 1.0)
+    return (first, 1 - share), (first + 1, share)
 
 
 def _hats(x, knots):
@@ -181,24 +220,18 @@ def _triples(first, count):
 
 
 def _differences(triples, unknowns, ridge=()):
-    """Rows of second differences for every complete triple of unknowns, and of first for a ridge."""
-    rows = []
-    for triple in triples:
-        if all(k is not None for k in triple):
-            row = np.zeros(unknowns)
-            row[triple] = (1.0, -2.0, 1.0)
-            rows.append(row)
-    for k in ridge:
-        row = np.zeros(unknowns)
-        row[k] = RIDGE
-        rows.append(row)
-    return np.stack(rows)
+    """Rows of second differences for every complete triple of unknowns, and a small one for each unknown of a ridge."""
+    whole = [t for t in triples if None not in t]
+    values = np.append(np.tile((1.0, -2.0, 1.0), len(whole)), np.full(len(ridge), RIDGE))
+    columns = np.append(np.asarray(whole, int).ravel(), np.asarray(ridge, int))
+    rows = np.append(np.repeat(np.arange(len(whole)), 3), len(whole) + np.arange(len(ridge)))
+    return csr_array((values, (rows, columns)), (len(whole) + len(ridge), unknowns))
 
 
 def held_basis(hysteresis, total: float) -> DensityBasis:
     """No unknown at all: the masses of an operator as they are."""
     masses = np.asarray(hysteresis.masses)
-    none = np.zeros((masses.size, 0))
+    none = csc_array((masses.size, 0))
     return DensityBasis(float(hysteresis.low), float(hysteresis.high), len(masses), none, (), total, np.zeros(0), 0, 0, masses)
 
 
@@ -206,21 +239,13 @@ def held_basis(hysteresis, total: float) -> DensityBasis:
 def cell_basis(low: float, high: float, total: float, level: int) -> DensityBasis:
     """One unknown a cell, the form of T&B Sec. 2.1, with the once-switching column; penalties along s and r."""
     size = level + 2
-    number, columns = {}, []
     area = level * level / 2
-    for i in range(level):
-        for j in range(i + 1):
-            mass = np.zeros((size, size))
-            mass[i + 1, j + 1] = (0.5 if i == j else 1.0) / area
-            number[i, j] = len(columns)
-            columns.append(mass.ravel())
-    main = len(columns)
-    for column in (True, False):
-        for i in range(level):
-            mass = np.zeros((size, size))
-            mass[(i + 1, 0) if column else (-1, i + 1)] = 1.0 / level
-            columns.append(mass.ravel())
-    cells = np.stack(columns, axis=1)
+    inner = [(i, j) for i in range(level) for j in range(i + 1)]
+    number, main = {pair: k for k, pair in enumerate(inner)}, len(inner)
+    places = [(i + 1) * size + j + 1 for i, j in inner]
+    places += [(i + 1) * size for i in range(level)] + [(size - 1) * size + i + 1 for i in range(level)]
+    shares = [(0.5 if i == j else 1.0) / area for i, j in inner] + [1.0 / level] * (2 * level)
+    cells = csc_array((shares, (places, range(len(places)))), (size * size, len(places)))
     along_s = [[number.get((i + d, j + d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
     along_r = [[number.get((i + d, j - d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
     once = _triples(main, level) + _triples(main + level, level)

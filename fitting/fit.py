@@ -21,12 +21,16 @@ from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 CELLS = tuple({"knots": None, "level": level} for level in (32, 40))  # a mass a cell: a rough density may need them
-FINER = (  # densities that are tried where the misfit asks for them, step by step, those of one step side by side
-    ({"knots": (26, 18), "level": 104},),
-    ({"knots": (36, 24), "level": 108}, *CELLS),
+FINER = (  # densities tried where the misfit asks for them, those of one step side by side; of one level: they share programs
+    ({"knots": (26, 18), "level": 120},),
+    ({"knots": (36, 24), "level": 120}, *CELLS),
     ({"knots": (48, 32), "level": 120},),
 )
-FINER_MATERIAL = FINER[0], ({"knots": (36, 24), "level": 144},), ()  # where the field is known loops are steep, and cells too wide
+FINER_MATERIAL = (  # where the field is known loops are steep, and cells too wide
+    ({"knots": (26, 18), "level": 104},),
+    ({"knots": (36, 24), "level": 144},),
+    (),
+)
 FINER_FROM = (1.05, 1.5, 2.0)  # chi2/N from which each step is tried,
 FINER_TAKES = (0.7, 0.5, 0.5)  # and the share of the excess that it may leave
 CELLS_MEET = 1.25  # chi2/N that cells must reach too: they take up physics, but not all of it
@@ -148,7 +152,7 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
         def one(say):
             known, z = build_problem(spectra, actuator, bench, names, tried, _density(start)) if posed is None else posed
             same = start is not None and start.problem.layout.density_unknowns == known.layout.density_unknowns
-            weights = start.solution.weights if same else START_WEIGHTS[: len(known.layout.penalties)]
+            weights = start.solution.weights if same else START_WEIGHTS[: len(known.penalties)]
             found = solve(
                 known,
                 z,

@@ -93,15 +93,11 @@ def foretold(result, spectra) -> Foretold:
     What is not linear in the unknowns is left out.
     """
     problem, z = result.problem, result.solution.z
-    layout, count = problem.layout, len(problem.spectra)
+    layout = problem.layout
     memories = layout.memories
-    residuals, slopes = [], []
-    for at in range(0, len(spectra), count):  # as many at a time as the fit had: its compiled programs serve
-        some = spectra[at : at + count]
-        rows, own = _whitened(result, [*some, *[some[-1]] * (count - len(some))], len(some))
-        residuals.append(rows)
-        slopes.append(own)
-    residual, slope = np.concatenate(residuals), np.concatenate(slopes)
+    most = memories or len(spectra)  # each has a level of M of its own, as those of the fit
+    parts = [_whitened(result, spectra[at : at + most]) for at in range(0, len(spectra), most)]
+    residual, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
     shared = len(z) - memories
     known = _known(result.solution, layout)[:shared, :shared]
     spread = slope[:, :shared] @ known @ slope[:, :shared].T
@@ -147,12 +143,12 @@ def _deviations(problem, spectrum):
     return found
 
 
-def _whitened(result, spectra, number: int):
-    """Misfit of the first `number` of the spectra in units of their noise, recording by recording, and its slopes."""
+def _whitened(result, spectra):
+    """Misfit of the spectra in units of their noise, recording by recording, and its slopes."""
     problem, predictor = result.problem, result.problem.predictors[0]
     corners = max(predictor.corners, 4 * int(np.ceil(max(nesting(np.tile(s.drive_at(PHASES), 2)) for s in spectra) / 4)))
     grids = tuple(
-        Predictor.build(spectra, samples, predictor.harmonics, predictor.periods, corners)
+        Predictor.build(spectra, samples, predictor.harmonics, predictor.periods, corners, apart=False)
         for samples in period_samples(result.choices, result.bench)
     )
     width = predictor.harmonics + 1
@@ -160,7 +156,7 @@ def _whitened(result, spectra, number: int):
     for row, s in zip(lines, spectra, strict=True):
         row[: len(s.reading)] = s.reading[:width]
     target = problem.target
-    zeros = jnp.zeros_like(target.gain_rows), jnp.zeros_like(target.gain_shares)
+    zeros = jnp.zeros(lines.shape, complex), jnp.zeros((len(spectra),) * 2)
     values = jnp.asarray(lines), jnp.asarray(np.stack([_deviations(problem, s) for s in spectra])), *zeros
     target = eqx.tree_at(lambda t: (t.lines, t.deviations, t.gain_rows, t.gain_shares), target, values)
     z = np.array(result.solution.z)
@@ -168,5 +164,4 @@ def _whitened(result, spectra, number: int):
     theirs = dataclasses.replace(problem, predictors=grids, target=target, spectra=tuple(spectra))
     places = np.concatenate([np.repeat(np.arange(len(spectra)), width), np.repeat(np.arange(len(spectra)), width - 1)])
     order = np.argsort(places, kind="stable")
-    order = order[: number * (2 * width - 1)]
     return data_residual(theirs, z)[order], data_jacobian(theirs, z)[order]

@@ -4,6 +4,8 @@ import numpy as np
 
 from .uncertainty import WIDEN, covariance
 
+AT_ONCE = 1000  # cells
+
 
 def mass_errors(result) -> np.ndarray:
     """Standard errors of the masses of a `FitResult`, A/m, in the shape of `actuator.hysteresis.masses`; none where they are held.
@@ -15,9 +17,9 @@ def mass_errors(result) -> np.ndarray:
         return np.zeros(layout.held.shape)
     n = layout.density_unknowns
     hats = covariance(result.solution.normal, result.solution.z, layout)[:n, :n]
-    cells = np.concatenate(layout.cells)[:n].reshape(n, -1).T
-    variance = np.einsum("ij,jk,ik->i", cells, hats, cells, optimize=True)
-    side = int(round(np.sqrt(len(cells))))
+    cells, side = result.problem.basis.cells.tocsr(), layout.hats.size
+    parts = [cells[k : k + AT_ONCE] for k in range(0, side * side, AT_ONCE)]
+    variance = np.concatenate([part.multiply(part @ hats).sum(axis=1) for part in parts])
     return WIDEN * float(layout.total) * np.sqrt(np.maximum(variance, 0.0)).reshape(side, side)
 
 

@@ -12,11 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.sparse.csgraph import structural_rank
 
 from magjax.programs import kept
 
+from .density import DensityBasis
 from .model import Layout, Predictor, Target, whitened
 from .passes import Passes
 from .solver import SteppedLevenbergMarquardt, cost_of
@@ -45,6 +45,7 @@ class Problem:
     predictors: tuple[Predictor, Predictor]
     target: Target
     spectra: tuple
+    basis: DensityBasis
     quasistatic: bool = False  # the time axis is made up: nothing that depends on a rate may be claimed
 
     @property
@@ -57,6 +58,16 @@ class Problem:
         """Real numbers that the fit must meet."""
         finite = np.isfinite(np.asarray(self.target.deviations))
         return int(2 * finite.sum() - finite[:, 0].sum())
+
+    @property
+    def penalties(self) -> tuple:
+        """Roughness of the density: a sparse matrix of second differences a family."""
+        return self.basis.penalties
+
+    @property
+    def tables(self) -> tuple:
+        """Everett values of the density's unknowns, see `DensityBasis.tables`."""
+        return self.basis.tables
 
     @functools.cached_property
     def passes(self) -> Passes:
@@ -121,7 +132,7 @@ def data_residuals(problem: Problem, z, lines):
     return np.asarray(_read_residuals(*arguments))
 
 
-def evidence_weights(layout: Layout, z, normal, weights):
+def evidence_weights(layout: Layout, penalties, z, normal, weights):
     """One MacKay update of each roughness weight: effective number of unknowns over roughness."""
     n = layout.density_unknowns
     z = np.asarray(z)
@@ -132,8 +143,7 @@ def evidence_weights(layout: Layout, z, normal, weights):
     free = normal[np.ix_(inside, inside)]
     S[np.ix_(inside, inside)] = np.linalg.inv(free + 1e-12 * np.diag(np.diag(free)))
     new = []
-    for weight, D in zip(weights, layout.penalties, strict=True):
-        D = csr_array(np.asarray(D))
+    for weight, D in zip(weights, penalties, strict=True):
         roughness = float(np.sum((D @ z[:n]) ** 2))
         D = D[:, active[:n]]
         taken = weight * D.multiply(D @ S[:n, :n][np.ix_(active[:n], active[:n])]).sum()
@@ -147,9 +157,8 @@ def prior_matrix(problem: Problem, weights) -> np.ndarray:
     layout = problem.layout
     n = layout.density_unknowns
     matrix = np.zeros((layout.size, layout.size))
-    for weight, D in zip(weights, layout.penalties, strict=True):
-        D = np.asarray(D)
-        matrix[:n, :n] += weight * (D.T @ D)
+    for weight, D in zip(weights, problem.penalties, strict=True):
+        matrix[:n, :n] += (weight * (D.T @ D)).toarray()
     matrix[n, n] += float(problem.target.bottom_prior) ** 2
     matrix[n + 1 :, n + 1 :] += np.diag(np.asarray(problem.target.priors) ** 2)
     return matrix
@@ -209,7 +218,7 @@ def solve(
             stalled = len(gains) >= AT_END[0] and sum(gains[-AT_END[0] :]) < max(AT_END[1], AT_END[2] * state.cost)
             settled = stalled or bool(solver.terminate(residual_at, z, None, posed, state, frozenset())[0])
             if evidence and chi2 / count < FAR:
-                found = evidence_weights(layout, z, state.information + posed["prior"], weights)
+                found = evidence_weights(layout, problem.penalties, z, state.information + posed["prior"], weights)
                 moved = np.max(np.abs(np.log(found / weights)), initial=0.0)
                 weights = weights * np.clip(found / weights, 1 / 30, 30)
                 state = weighed(z, state, weights)

@@ -17,7 +17,7 @@ from magjax.preisach import Preisach
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
-from .density import COLUMNS, DensityBasis, on_device
+from .density import DensityBasis, Hats, everett_values, on_device
 
 ROWS, MOST_ROWS = 5, 15  # a program takes whole ROWS of recordings, the last of them repeated, and no more at once
 MEMORY = 3e-4  # of the total; prior deviation of each recording's level of M
@@ -34,9 +34,7 @@ class Layout(eqx.Module):
     one compiled program.
     """
 
-    cells: tuple[jax.Array, ...]  # of the density's unknowns, COLUMNS at a time: masses at a total of 1, (COLUMNS, cells, cells)
-    tables: tuple[jax.Array, ...]  # and their Everett values, (COLUMNS, levels, levels)
-    penalties: tuple[jax.Array, ...]
+    hats: Hats  # of the density's unknowns
     total: jax.Array
     starts: jax.Array
     scales: jax.Array
@@ -52,7 +50,7 @@ class Layout(eqx.Module):
     def build(basis, names, starts, scales, lows, highs, log, memories: int = 0) -> "Layout":
         """From a density basis and the free parameters' names, start values, scales, bounds and coordinate kinds."""
         return Layout(
-            *basis.placed, on_device(basis.total),
+            basis.hats, on_device(basis.total),
             on_device(starts), on_device(scales), on_device(lows), on_device(highs), tuple(names), tuple(log), basis.unknowns, memories,
             None if basis.held is None else on_device(basis.held),
         )  # fmt: skip
@@ -102,7 +100,8 @@ class Layout(eqx.Module):
         starts, scales, log = np.asarray(self.starts), np.asarray(self.scales), np.asarray(self.log, bool)
         n = self.density_unknowns + 1
         y = np.asarray(z)[n : n + len(starts)]
-        values = np.where(log, starts * np.exp(np.where(log, y, 0.0)), starts + scales * y)
+        with np.errstate(over="ignore"):  # of a trial step
+            values = np.where(log, starts * np.exp(np.where(log, y, 0.0)), starts + scales * y)
         return values, np.where(log, values, scales)
 
     def coordinate(self, name: str, value: float) -> float:
@@ -120,18 +119,12 @@ class Layout(eqx.Module):
         """The Preisach masses, A/m, (levels - 1, levels - 1)."""
         if self.held is not None:
             return self.held
-        return self._summed(z, self.cells)
+        return self.total * self.hats.masses(z[: self.density_unknowns])
 
     def plane(self, z):
-        """Masses and their Everett values at the levels, A/m, in NumPy, as sums over the basis, whose own are known."""
-        return tuple(self._summed(z, x, np) for x in (self.cells, self.tables))
-
-    def _summed(self, z, parts, xp=jnp):
-        """Over the density's unknowns. `xp`: jax.numpy or numpy."""
-        heights = xp.concatenate([z[: self.density_unknowns], xp.zeros(len(parts) * COLUMNS - self.density_unknowns)])
-        return xp.asarray(self.total) * sum(
-            xp.tensordot(heights[k * COLUMNS : (k + 1) * COLUMNS], xp.asarray(part), 1) for k, part in enumerate(parts)
-        )
+        """Masses and their Everett values at the levels, A/m, in NumPy."""
+        masses = float(self.total) * self.hats.masses(np.asarray(z)[: self.density_unknowns])
+        return masses, everett_values(masses)
 
     def actuator(self, template, z):
         """The actuator that the unknowns describe; `template` gives everything that is fixed (pure, differentiable)."""
@@ -151,14 +144,16 @@ class Grid:
     index: np.ndarray
 
 
-def period_grids(spectra, samples: int) -> tuple[Grid, ...]:
-    """Recordings grouped by how fine a grid their drive needs; `samples` points a period of the highest strong line."""
+def period_grids(spectra, samples: int, apart: bool = True) -> tuple[Grid, ...]:
+    """Recordings grouped by how fine a grid their drive needs, or on that of the finest where not `apart`; `samples` points a period
+    of the highest strong line."""
     groups: dict[int, list[int]] = {}
     for k, s in enumerate(spectra):
         power = np.abs(s.drive[1:]) ** 2
         strong = np.flatnonzero(power > 1e-3 * power.max())
         factor = int(2 ** np.ceil(np.log2(max(1, strong.max() + 1) / 1.5))) if strong.max() else 1
         groups.setdefault(samples * min(factor, 8), []).append(k)
+    groups = groups if apart else {max(groups): list(range(len(spectra)))}
     grids = []
     for n, members in groups.items():
         drive = np.stack([spectra[k].drive_at(np.arange(n) / n) for k in members])
@@ -178,9 +173,9 @@ class Predictor(eqx.Module):
     corners: int = eqx.field(static=True)
 
     @staticmethod
-    def build(spectra, samples: int, harmonics: int, periods: int, corners: int) -> "Predictor":
-        """For spectra on grids of `samples` points a period of the fastest strong line."""
-        grids = period_grids(spectra, samples)
+    def build(spectra, samples: int, harmonics: int, periods: int, corners: int, apart: bool = True) -> "Predictor":
+        """For spectra on grids of `samples` points a period of the fastest strong line; not `apart`: one program for all of them."""
+        grids = period_grids(spectra, samples, apart)
         order = np.argsort(np.concatenate([g.index for g in grids]))
         return Predictor(
             tuple(on_device(g.drive) for g in grids), tuple(on_device(g.dt) for g in grids),

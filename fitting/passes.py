@@ -83,9 +83,9 @@ class Passes:
         moving = sorted(n for n in (*free, *own) if n.rpartition(".")[0] not in behind and not n.startswith("sensor."))
         self.march = _Template(marching(template), tuple(moving), layout)
         self.read = _Template(template, tuple(sorted((*free, *own))), layout)
-        self.total, self.tops = float(layout.total), [np.asarray(t[:, -1, 0]) for t in map(np.asarray, layout.tables)]
-        self.held = None if layout.held is None else float(np.sum(layout.held))
-        self.none = (None, None) if self.held is not None else tuple(np.zeros(x[0].shape) for x in (layout.cells, layout.tables))
+        self.total, self.held = float(layout.total), None if layout.held is None else float(np.sum(layout.held))
+        planes = ((COLUMNS, size, size) for size in (layout.hats.size, layout.hats.size + 1))
+        self.none = (None, None) if self.held is not None else tuple(map(np.zeros, planes))
         self.target = Target(*(np.asarray(getattr(problem.target, f.name)) for f in dataclasses.fields(Target)))
         self.order = np.asarray(problem.predictors[0].index)
 
@@ -167,12 +167,12 @@ class Passes:
     def _directions(self, z, columns) -> Point:
         """Of each of the unknowns `columns`, COLUMNS in all."""
         layout, part, offset = self.problem.layout, columns[0] // COLUMNS, np.zeros(COLUMNS)
-        hats = self.held is None and part < len(layout.cells)
+        hats = self.held is None and part < len(self.problem.tables)
         if hats:
-            offset += self.total * self.tops[part]
+            offset += self.total * np.asarray(self.problem.tables[part][:, -1, 0])
         if layout.density_unknowns in columns:
             offset[layout.density_unknowns - columns[0]] = self.total
-        masses, values = (layout.cells[part], layout.tables[part]) if hats else self.none
+        masses, values = (layout.hats.each(columns[0]), self.problem.tables[part]) if hats else self.none
         return Point(masses, values, offset, self.march.slopes(z, columns))
 
     def _along(self, towards, part, places, columns) -> Point:

@@ -195,8 +195,8 @@ class Projector:
         J = data_jacobian(problem, z)
         free = np.append(z[:n] > 0, np.ones(len(z) - n, bool))
         rows, leftover = [], []
-        for w, D in zip(UNDERSMOOTH * solution.weights, layout.penalties, strict=True):
-            rows.append(np.sqrt(w) * np.asarray(D))
+        for w, D in zip(UNDERSMOOTH * solution.weights, problem.penalties, strict=True):
+            rows.append(np.sqrt(w) * D.toarray())
             leftover.append(rows[-1] @ z[:n])
         prior = np.zeros((sum(len(r) for r in rows) + len(z) - n - 1, len(z)))
         at = 0

@@ -175,7 +175,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     template = actuator if held else make_start_actuator(actuator, basis, rest)
     if isinstance(bench.start, tuple) and not held:
         template = template.remembering(bench.start)
-    problem = Problem(layout, template, predictors, target, tuple(spectra), bench.quasistatic)
+    problem = Problem(layout, template, predictors, target, tuple(spectra), basis, bench.quasistatic)
     return problem, np.concatenate([start, np.zeros(len(names) + memories)])
 
 

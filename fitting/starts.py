@@ -21,19 +21,22 @@ SIGNS = 50  # instants of a period at which the sign of M is sought
 def everett_rows(basis, alpha, beta) -> np.ndarray:
     """T(alpha, beta) of every basis function at total mass 1, (points, unknowns)."""
     L = basis.size
-    values = np.moveaxis(basis.tables, 0, -1)
     k = np.arange(L)
-    diagonal = values[k, k + 1]
     step = (basis.high - basis.low) / L
 
     def locate(field):
         place = np.clip((np.asarray(field) - basis.low) / step, 0, L)
         cell = np.clip(np.floor(place), 0, L - 1).astype(int)
-        return cell, (place - cell)[:, None]
+        return cell, place - cell
 
     (i, p), (j, q) = locate(alpha), locate(beta)
-    flat = (1 - p) * ((1 - q) * values[i, j] + q * values[i, j + 1]) + p * ((1 - q) * values[i + 1, j] + q * values[i + 1, j + 1])
-    return flat - p * (1 - p) * diagonal[i] - q * (1 - q) * diagonal[j]
+
+    def rows(T):
+        corners = (1 - p) * ((1 - q) * T[:, i, j] + q * T[:, i, j + 1]) + p * ((1 - q) * T[:, i + 1, j] + q * T[:, i + 1, j + 1])
+        diagonal = T[:, k, k + 1]
+        return corners - p * (1 - p) * diagonal[:, i] - q * (1 - q) * diagonal[:, j]
+
+    return np.concatenate([rows(np.asarray(T)) for T in basis.tables])[: basis.unknowns].T
 
 
 def operator_rows(basis, field: np.ndarray, history=()) -> np.ndarray:
@@ -73,7 +76,7 @@ def unreached_row(basis, highest, lowest, rest):
     step = (basis.high - basis.low) / basis.size
     edge = (basis.low - rest) / step + np.arange(basis.size + 1)
     share = unreached_share(edge, (highest - rest) / step, (lowest - rest) / step, np)
-    return 2 * (np.tril(share) * (1 + np.eye(basis.size))).ravel() @ basis.cells
+    return 2 * (basis.cells.T @ (np.tril(share) * (1 + np.eye(basis.size))).ravel())
 
 
 def inferred_loops(spectra, deviations, actuator, samples: int = 200, touching: bool = False):
@@ -198,7 +201,7 @@ def equation_error_start(basis, spectra, deviations, actuator, max_frequency=Non
     n = basis.unknowns
     normal, gradient = A.T @ A, -A.T @ b
     for weight, D in zip((3.0, 3.0, 30.0, 3.0), basis.penalties, strict=False):
-        normal[:n, :n] += weight * D.T @ D
+        normal[:n, :n] += (weight * (D.T @ D)).toarray()
     normal += 1e-8 * np.trace(normal) / len(normal) * np.eye(n + 1)
     solution = bounded_minimum(normal, gradient, np.zeros(n + 1), (np.append(np.zeros(n), -np.inf), np.full(n + 1, np.inf)))
     misfit = float(np.sqrt(np.mean((A @ solution - b) ** 2)))

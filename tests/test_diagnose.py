@@ -180,9 +180,9 @@ def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(mo
 def test_masses_of_cells_or_finer_hats_serve_a_final_model_where_they_promise_to_foretell_better(bench, monkeypatch, left, by_cells, taken):
     """And are not asked for where hats leave little."""
     now, levels = a_fit(left, 60.0), []
-    now.choices, now.spectra, now.unknowns = Choices(knots=(26, 18), level=104), (), 30.0
+    now.choices, now.spectra, now.unknowns = Choices(knots=(26, 18), level=120), (), 30.0
     now.bench, now.problem = bench, SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy", "sensor.offset")))
-    fits = dict(zip((32, 40, 108), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))
+    fits = dict(zip((32, 40, 120), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))
     for found, (_, unknowns) in zip(fits.values(), by_cells, strict=True):
         found.unknowns = unknowns
     monkeypatch.setattr(
@@ -350,7 +350,7 @@ def test_effects_are_held_against_means_on_the_density_that_these_got(monkeypatc
     own = RecordEffect("zero_drift", 90.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
     monkeypatch.setattr(signals_module, "zeros_of", lambda *a: [own])
     base, freed, beside = a_fit(9.4, 55.0), a_fit(1.0, 60.0), a_fit(5.7, 56.0)
-    for found, choices in ((base, Choices()), (freed, Choices(knots=(26, 18), level=104)), (beside, Choices(knots=(26, 18), level=104))):
+    for found, choices in ((base, Choices()), (freed, Choices(knots=(26, 18), level=120)), (beside, Choices(knots=(26, 18), level=120))):
         found.choices, found.problem, found.refined, found.spectra, found.data_count = choices, None, None, None, 1000
     monkeypatch.setattr(Task, "fit", lambda task, actuator: freed)
     monkeypatch.setattr(Task, "fit_on", lambda task, start, actuator, spectra: beside if start is freed else None)

@@ -11,6 +11,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import scipy.optimize
+from scipy.sparse import csc_array
 
 import magjax.bench
 from fitting.check import check_errors
@@ -550,7 +551,7 @@ def test_parameters_stay_between_their_bounds(monkeypatch):
     from fitting import joint
     from fitting.model import Layout
 
-    basis = DensityBasis(0.0, 1.0, 2, np.ones((4, 1)), (), 1.0, np.ones(1), 1, 1)
+    basis = DensityBasis(0.0, 1.0, 2, csc_array(np.ones((4, 1))), (), 1.0, np.ones(1), 1, 1)
     ends = np.array([0.0, -0.5, 0.0, -np.inf]), np.array([1.0, 0.5, np.inf, np.inf])
     layout = Layout.build(basis, "abcd", [0.0, 0.2, 2.0, 5.0], [0.5, 0.1, 1.0, 1.0], *ends, [False, False, True, False])
     assert layout.bounds[0] == pytest.approx([0, -np.inf, 0, -7, -np.inf, -np.inf])
@@ -576,9 +577,10 @@ def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
     monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: sloped(z))
     monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(2))
     monkeypatch.setattr(solver, "bent_step", lambda residual_at, bounds, y, new, *rest: new)
-    monkeypatch.setattr(joint, "evidence_weights", lambda layout, z, normal, weights: weights)
+    monkeypatch.setattr(joint, "evidence_weights", lambda layout, penalties, z, normal, weights: weights)
     monkeypatch.setattr(joint, "AT_END", most)
-    problem = SimpleNamespace(layout=SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf))), data_count=1000)
+    layout = SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf)))
+    problem = SimpleNamespace(layout=layout, penalties=(), data_count=1000)
     found = joint.solve(problem, np.asarray([2.0, 0.5]), np.ones(1))
     assert found.jacobians < 12 if most[0] == 4 else found.jacobians == 30
 

@@ -233,7 +233,7 @@ def test_the_normal_matrix_is_that_of_the_weights_returned(tmp_path):
     problem, z = build_problem(
         spectra, bench.actuator(), bench, ("piezo.chi",), Choices(level=20, knots=(7, 6), coarse=100, fine=200, rest="negative")
     )
-    found = solve(problem, z, (1e2,) * len(problem.layout.penalties), max_jacobians=4)
+    found = solve(problem, z, (1e2,) * len(problem.penalties), max_jacobians=4)
     left = found.normal - prior_matrix(problem, found.weights)
     J = data_jacobian(problem, z)
     assert np.linalg.eigvalsh(left).min() > -1e-6 * np.linalg.eigvalsh(J.T @ J).max()

@@ -200,22 +200,26 @@ def _inside(result, chosen) -> dict:
 
 def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict:
     """Measured and predicted periods of check recordings, before and after a repair; `own_zeros`: which leaves each its level."""
+    from ..check import predicted_periods
     from ..spectra import reduce_recording
 
     found = {}
-    for k, recording in enumerate(recordings):
-        if recording.frequency() is None:
-            continue
-        s = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
+    periodic = [k for k, r in enumerate(recordings) if r.frequency() is not None]
+    spectra = [reduce_recording(recordings[k], bench.drive, bench.output, columns=bench.columns) for k in periodic]
+    if not spectra:
+        return found
+    first = predicted_periods(before, spectra)
+    lines = {"before": first, "after": first if after is before else predicted_periods(after, spectra)}
+    for at, (k, s) in enumerate(zip(periodic, spectra, strict=True)):
+        recording = recordings[k]
         phases, residue, count = by_phase(s, s.residue, BINS)
         measured = evaluate_lines(s.reading, phases) + residue
         entry = {
             "name": np.array(_short(recording.origin.get("file", recording.name))), "frequency": np.array(s.frequency), "phase": phases,
             "drive": s.drive_at(phases), "measured": measured, "noise": s.noise_rms / np.sqrt(np.maximum(count, 1)),
         }  # fmt: skip
-        for key, actuator in (("before", before), ("after", after)):
-            reading = np.asarray(steady(actuator, s).reading)
-            predicted = np.interp(phases, np.arange(len(reading) + 1) / len(reading), np.append(reading, reading[0]))
+        for key in ("before", "after"):
+            predicted = evaluate_lines(lines[key][at], phases)
             levelled = bench.output == "flux_density" or (own_zeros and key == "after")
             entry[key] = predicted - (predicted.mean() - measured.mean()) * levelled
         found[str(k)] = entry

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.sparse import csc_array
 
 from magjax.effects import ExcessLoss, QuarticMagnetostriction, SecondMode, SensorLag, TransportDelay
 from magjax.errors import ConfigurationError
@@ -208,14 +209,14 @@ def test_errors_of_a_fit_in_the_static_bound():
     cells = np.tril(np.ones((25, 25))).reshape(-1, 1) * rng.random((625, 3))
     root = rng.standard_normal((4, 4))
     spread = root @ root.T + np.eye(4)
-    parts = (cells[:, :2].T.reshape(2, 25, 25), np.stack([cells[:, 2].reshape(25, 25), np.zeros((25, 25))]))
-    layout = SimpleNamespace(density_unknowns=3, cells=parts, total=2.0, inside=lambda z: z > 0, held=None)
+    basis = SimpleNamespace(cells=csc_array(cells))
+    layout = SimpleNamespace(density_unknowns=3, hats=SimpleNamespace(size=25), total=2.0, inside=lambda z: z > 0, held=None)
     solution = SimpleNamespace(normal=np.linalg.inv(spread), z=np.ones(4))
-    result = SimpleNamespace(problem=SimpleNamespace(layout=layout), solution=solution, actuator=act)
+    result = SimpleNamespace(problem=SimpleNamespace(layout=layout, basis=basis), solution=solution, actuator=act)
     errors = mass_errors(result)
     draws = 1.3 * 2.0 * rng.multivariate_normal(np.zeros(3), spread[:3, :3], 20000) @ cells.T
     assert errors.ravel() == pytest.approx(draws.std(axis=0), rel=0.05, abs=1e-12)
-    held = SimpleNamespace(problem=SimpleNamespace(layout=SimpleNamespace(held=np.ones((25, 25)), cells=())))
+    held = SimpleNamespace(problem=SimpleNamespace(layout=SimpleNamespace(held=np.ones((25, 25)))))
     assert mass_errors(held).shape == (25, 25) and not mass_errors(held).any()
     bound = inversion_bound(result)
     assert bound.value - static_bound(PlainActuator.from_actuator(act), delta_I=0.0).value == pytest.approx(errors.sum())
