@@ -213,6 +213,27 @@ def test_strong_friction_of_a_little_damped_rod_is_settled(frequency, monkeypatc
     assert np.sqrt(np.mean((found - true) ** 2)) < 0.005 * np.sqrt(np.mean(true**2))
 
 
+@pytest.mark.parametrize("frequency", [40.0, 175.0])
+def test_the_derivative_of_friction_is_that_of_all_passes(frequency):
+    """By the force, its presliding, the rod and the drive: it is taken from the last pass and what that makes of a period's begin."""
+    act = dataclasses.replace(actuator(20), mechanics=Mechanics(jnp.asarray(500.0), jnp.asarray(0.055)))
+    line = Timeline(jnp.asarray(1 / (frequency * 500)), 500, True)
+    turn = 2 * jnp.pi * jnp.arange(500) / 500
+
+    @jax.jit
+    def moved(change):
+        rod = act.replace({"mechanics.f0": 500.0 * (1 + change[2]), "mechanics.xi": 0.055 * (1 + change[2])})
+        effect = effects.CoulombFriction(f=2e-6 * (1 + change[0]), v_s=1e-4, presliding=4e-7 * (1 + change[1]))
+        linear = line.filter(1.5e-5 * (jnp.sin(turn) + (0.3 + change[3]) * jnp.sin(2 * turn + 1)), rod.mechanics.response)
+        return effect.displacement(linear, None, None, line, rod) - linear
+
+    slopes = np.asarray(jax.jacfwd(moved)(jnp.zeros(4)))
+    for k, slope in enumerate(slopes.T):
+        h = 1e-5 * jnp.eye(4)[k]
+        expected = np.asarray(moved(h) - moved(-h)) / 2e-5
+        assert np.sqrt(np.mean((slope - expected) ** 2)) < 2e-3 * np.sqrt(np.mean(expected**2))
+
+
 def test_creep_weighs_its_lags_by_a_power_of_time():
     line, signal = Timeline(jnp.asarray(1e-3), 200, True), jnp.sin(2 * jnp.pi * jnp.arange(200) / 200)  # 5 Hz
     s = 2j * np.pi * 5

@@ -14,6 +14,7 @@ NEWTON = 8  # steps to the displacement that a sample's friction allows; from th
 VISCOUS = 0.1  # m/s, below which friction that is still viscous is none: a damper
 NEVER_PAST = 2e-5  # m of presliding, within which the rod hardly leaves it: a spring with losses
 PASSES = 7  # over a period; each begins with the steady response to the friction of the one before
+FURTHER = 4  # doublings of what they are carried on by
 FINEST = 2000  # samples a period at least: after each turn the rod swings at its own frequency, far above a slow drive's
 
 
@@ -38,6 +39,55 @@ def _closer(moved, low, high, free, p, reach, law):
     low, high = jnp.where(left < 0, moved, low), jnp.where(left < 0, high, moved)
     step = moved - left / slope
     return jnp.where((step >= low) & (step <= high), step, 0.5 * (low + high)), low, high
+
+
+def _share(free, p, reach, law, moved):
+    """The friction's share after a sample, differentiable, where the motion `moved` that it allows is known."""
+    left, slope = _balance(moved, free, p, reach, law)
+    return _turned(moved - left / jax.lax.stop_gradient(slope), p, law)
+
+
+def _settled(passed, steady, law, reach, f, mechanics, held, displacement):
+    """The friction's own motion over a period after `PASSES` and, to first order, 2 ** FURTHER more; and its derivative.
+
+    A derivative goes through the last pass alone, step by step with known slopes by free motion and share. What it and the last
+    pass make of the period's begin is carried on by powers of the three by three matrix of a pass.
+    """
+
+    def again(_, begin):
+        return steady(passed(begin)[3], f, mechanics)[1]
+
+    begin = jax.lax.stop_gradient(jax.lax.fori_loop(0, PASSES - 1, again, jnp.zeros(3, displacement.dtype)))
+    free, before, moved, *_ = jax.lax.stop_gradient(passed(begin))
+    fixed = jax.lax.stop_gradient((reach, law))
+    by_free, by_share = (
+        jax.jvp(lambda x, y: _share(x, y, *fixed, moved), (free, before), along)[1]
+        for along in ((jnp.ones_like(free), jnp.zeros_like(free)), (jnp.zeros_like(free), jnp.ones_like(free)))
+    )
+
+    def replay(begin, displacement, reach, law, f, mechanics, held):
+        ((a, b), (c, d)), first, last = held[0], -f * (held[1] - held[2]), -f * held[2]
+
+        def step(carry, here):  # number by number: a product of matrices stands in the way of the compiler
+            x, y, p = carry  # own motion and its rate, share
+            share, by_free, by_share = here
+            free, y = a * x + b * y + first[0] * p, c * x + d * y + first[1] * p
+            now = share + by_free * (free - x) + by_share * p
+            return (free + last[0] * now, y + last[1] * now, now), now
+
+        linear = jnp.concatenate([displacement[-1:], displacement])
+        share = _share(free, before, reach, law, moved) + by_free * (jnp.diff(linear) - free) - by_share * before
+        late = jax.lax.scan(step, tuple(begin), (share, by_free, by_share))[1]
+        return steady(late, f, mechanics)
+
+    live = displacement, reach, law, f, mechanics, held
+    _, push = jax.linearize(lambda x: replay(x, *jax.lax.stop_gradient(live)), begin)
+    by_begin, matrix = jax.vmap(push)(jnp.eye(3, dtype=begin.dtype))  # (3, time), (3, 3): row by row what each number changes
+    further = jnp.eye(3, dtype=begin.dtype)  # what passes without end make of the begin, but for a share that hardly leaves the presliding
+    for _ in range(FURTHER):
+        further, matrix = further + further @ matrix, matrix @ matrix
+    own, end = replay(begin, *live)
+    return own + (end - begin) @ further @ by_begin
 
 
 class CoulombFriction(AbstractEffect):
@@ -120,27 +170,27 @@ class CoulombFriction(AbstractEffect):
                 moved, low, high = _closer(moved, low, high, free, p, reach, law)
             return moved
 
-        def advance(carry, linear):
+        def step(carry, linear):
             state, p, before = carry  # of the friction's own motion; turned share; displacement with friction
             rest = A @ state - (gain - rise) * self.f * p
             free = linear + rest[0] - before
             moved = allowed(free, p, reach, law)
-            left, slope = _balance(moved, free, p, reach, law)  # one differentiable step more
-            p = _turned(moved - left / jax.lax.stop_gradient(slope), p, law)
-            state = rest - rise * self.f * p
-            return (state, p, linear + state[0]), (p, state[0])
+            now = _share(free, p, reach, law, moved)
+            state = rest - rise * self.f * now
+            return (state, now, linear + state[0]), (free, p, moved, now, state[0])
 
         state, p = jnp.zeros(2, displacement.dtype), jnp.zeros_like(displacement[0])
         if not line.periodic:
-            _, (_, own) = jax.lax.scan(advance, (state, p, displacement[0]), displacement)
+            _, (*_, own) = jax.lax.scan(step, (state, p, displacement[0]), displacement)
             return displacement + own
 
-        def again(_, begin):
-            state, p, _ = begin
-            (_, p, _), (late, _) = jax.lax.scan(advance, (state, p, displacement[-1] + state[0]), displacement)
-            force = -self.f * late
-            own = line.filter(force, mechanics.response)
-            velocity = line.filter(force, lambda s: mechanics.response(s) * s / (2 * jnp.pi * mechanics.f0))
-            return jnp.stack([own[-1], velocity[-1]]), p, own
+        def steady(late, f, mechanics):
+            """Motion by a period's turned shares, and where the next period begins: (own motion, its rate, share)."""
+            own = line.filter(-f * late, mechanics.response)
+            rate = line.filter(-f * late, lambda s: mechanics.response(s) * s / (2 * jnp.pi * mechanics.f0))
+            return own, jnp.stack([own[-1], rate[-1], late[-1]])
 
-        return displacement + jax.lax.fori_loop(0, PASSES, again, (state, p, jnp.zeros_like(displacement)))[2]
+        def passed(begin):
+            return jax.lax.scan(step, (begin[:2], begin[2], displacement[-1] + begin[0]), displacement)[1]
+
+        return displacement + _settled(passed, steady, law, reach, self.f, mechanics, (A, gain, rise), displacement)
