@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fitting.diagnose as module
-from fitting.check import beyond_plane, check_errors
+from fitting.check import beyond_plane, check_errors, predictions
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.reach import beyond_text
@@ -45,6 +45,28 @@ def test_a_drive_beyond_the_plane_is_predicted_and_told(periods):
     assert text in checks(rows)["note"]
     assert beyond_text(rows[:1]) == "" and beyond_text([{"file": "old"}]) == ""
     assert str(Diagnosis("nothing_missing", "All is well.", check=tuple(rows[:1]))) == "nothing_missing: All is well."
+
+
+def test_recordings_of_all_kinds_are_foretold_together():
+    """One program on the finest grid that any of them asks for: each prediction is that of the recording alone."""
+    bench = load_bench("aa-050h")
+    actuator, phase = bench.actuator(), 2 * np.pi * np.arange(1500) / 500
+    many = Recording(
+        np.arange(1500) / (20 * 500),
+        {"current": 0.3 * np.sin(phase) + 0.2 * np.sin(7 * phase), "displacement": 2e-5 + 1e-6 * np.sin(phase)},
+        {},
+        {"file": "many.csv"},
+        "many",
+    )
+    runs = [recording(0.6, "plain.csv"), recording(0.5, "short.csv", 0.4), many, recording(0.3, "small.csv")]
+    together = predictions(actuator, runs, bench)
+    for run, (predicted, measured, noise) in zip(runs, together, strict=True):
+        ((alone, its_own, floor),) = predictions(actuator, [run], bench)
+        assert predicted == pytest.approx(alone, abs=2e-4 * np.ptp(alone)) and np.array_equal(measured, its_own) and noise == floor
+    assert [noise is None for *_, noise in together] == [False, True, False, False]
+    rows = check_errors(actuator, actuator, runs, bench)
+    assert [r["file"] for r in rows] == ["runs/plain.csv", "runs/short.csv", "many.csv", "runs/small.csv"]
+    assert all(r["rms_before"] == r["rms_after"] > 0 for r in rows)
 
 
 def test_a_simulation_still_refuses_unless_told_to_saturate():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import magjax.effects as effects
-from magjax.chain import BLOCKS, Timeline
+from magjax.chain import BLOCKS, Timeline, newton
 from magjax.chain.march import magnetize
 from magjax.chain.mechanics import Mechanics
 from magjax.effects import CATALOGUE, AbstractEffect
@@ -211,6 +211,30 @@ def test_strong_friction_of_a_little_damped_rod_is_settled(frequency, monkeypatc
     monkeypatch.setattr(module, "PASSES", 16)
     true = lost(8000)
     assert np.sqrt(np.mean((found - true) ** 2)) < 0.005 * np.sqrt(np.mean(true**2))
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        effects.StressFeedback(stiffness=3e11), effects.ExcessLoss(k=80.0, rate_knee=0.1), effects.RateDependentSwitching(gamma=60.0, rate0=1e3),
+        effects.MagneticAftereffect(share=0.1), effects.MeanField(alpha=8e-3),
+    ],
+    ids=lambda e: e.name,
+)  # fmt: skip
+def test_steps_with_an_effect_settle_as_bracketed_ones_do(effect, monkeypatch):
+    """Newton's method for what the effect adds, and the bracket that is there where this does not settle."""
+    act = actuator(20).with_effect(effect)
+
+    def march():
+        found = jax.jit(lambda current: run_chain(act, current, DT, 2, 4))(CURRENT)
+        return np.asarray(found.field), np.asarray(found.residual)
+
+    H, left = march()
+    monkeypatch.setattr(newton, "MOST_LINEAR", 0)
+    bracketed, left_there = march()
+    plain = np.asarray(run_chain(actuator(20), CURRENT, DT, 2, 4).field)
+    assert np.abs(H - plain).max() > 1.0
+    assert np.abs(H - bracketed).max() < 5e-5 and max(np.abs(left).max(), np.abs(left_there).max()) < 5e-5  # of 1e4 A/m
 
 
 @pytest.mark.parametrize("frequency", [40.0, 175.0])

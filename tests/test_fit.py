@@ -16,8 +16,8 @@ from scipy.sparse import csc_array
 import magjax.bench
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
-from fitting.density import DensityBasis, cell_basis, hat_basis
-from fitting.fit import beyond_the_rod, cells_beside, finer_hats, finer_than, fit, guessed, loose, valleys
+from fitting.density import COLUMNS, DensityBasis, cell_basis, everett_values, hat_basis
+from fitting.fit import FINER, beyond_the_rod, cells_beside, finer_hats, finer_than, fit, guessed, loose, valleys
 from fitting.joint import data_residual
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices, build_problem, free_parameters, spectra_of
@@ -248,6 +248,16 @@ def test_linear_rows_are_the_operator(make):
     field = rng.uniform(-100, 900, 40)
     operator = Preisach(basis.masses(x), basis.low, basis.high, float(basis.masses(x).sum()))
     assert operator_rows(basis, field) @ x == pytest.approx(np.asarray(operator.magnetization(field, corners=30)), abs=1e-12)
+    masses = np.asarray(operator.masses)
+    assert basis.hats.masses(x) == pytest.approx(masses) == np.asarray(basis.hats.masses(jnp.asarray(x)))
+    assert everett_values(masses) == pytest.approx(np.asarray(operator.table().values))
+    every = np.concatenate([basis.hats.each(k) for k in range(0, basis.unknowns, COLUMNS)])
+    assert np.tensordot(x, every[: basis.unknowns], 1) == pytest.approx(masses) and not every[basis.unknowns :].any()
+
+
+def test_finer_hats_share_their_programs():
+    """What is compiled depends on the level of the plane alone."""
+    assert len({row["level"] for step in FINER for row in step if row["knots"]}) == 1
 
 
 def test_bounded_minimum_meets_the_optimality_conditions():

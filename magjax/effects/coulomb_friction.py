@@ -83,7 +83,7 @@ def _settled(passed, steady, law, reach, f, mechanics, held, displacement):
     live = displacement, reach, law, f, mechanics, held
     _, push = jax.linearize(lambda x: replay(x, *jax.lax.stop_gradient(live)), begin)
     by_begin, matrix = jax.vmap(push)(jnp.eye(3, dtype=begin.dtype))  # (3, time), (3, 3): row by row what each number changes
-    further = jnp.eye(3, dtype=begin.dtype)  # what passes without end make of the begin, but for a share that hardly leaves the presliding
+    further = jnp.eye(3, dtype=begin.dtype)  # the sum of the powers of a pass
     for _ in range(FURTHER):
         further, matrix = further + further @ matrix, matrix @ matrix
     own, end = replay(begin, *live)
