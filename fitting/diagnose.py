@@ -23,7 +23,7 @@ from .check import check_errors
 from .fit import REFINE_BELOW, finer_than
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
-from .learned import better_learned, with_learned_term
+from .learned import MANY, better_learned, with_learned_term
 from .locate import where
 from .own_signals import hum_on_harmonics, needless_zeros, own_zeros, record_level, sensor_zero, unsettled_means, with_zero
 from .reach import BEYOND
@@ -230,11 +230,13 @@ def _concluded(task, evidence) -> Diagnosis:
 
 def _wrong_name(task, evidence, found):
     """A learned term that serves far better than the effects that were named, in another block, and foretells the check recordings
-    no worse, where these leave a misfit; None elsewhere."""
+    no worse, where these leave a misfit, or one that serves as well as `MANY`; None elsewhere."""
     alone = evidence if len(evidence.reached.steps) == 1 else first_alone(evidence)
     named = alone if alone is not None and found.repaired is alone.reached.current else evidence
     steps, current = named.reached.steps, named.reached.current
-    if found.verdict not in ("attributed", "group") or not steps or not found.repaired.chi2_per_sample > LEAVES_MISFIT:
+    if found.verdict not in ("attributed", "group") or not steps:
+        return None
+    if not found.repaired.chi2_per_sample > LEAVES_MISFIT and len(steps) < MANY:
         return None
     blocks = {t.candidate.block for _, rivals, *_ in steps for t in rivals}
     learned = better_learned(evidence.plain, current, blocks, evidence.recordings, evidence.bench, len(steps), task.progress)

@@ -30,6 +30,7 @@ MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence ar
 CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned function leaves where the effect is the wrong name
+MANY = 3  # effects in place of which a function that leaves no more is the better word: so many at once are seldom missing
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 BASE_LOSSES = {("coil", "flux_rate"): "R_eddy", ("mechanics", "displacement_rate"): "xi"}
@@ -304,7 +305,8 @@ def described(learned: Learned) -> dict:
 
 def better_learned(base, named, blocks, recordings, bench, number: int = 1, progress=None) -> Learned | None:
     """A term that shows effects to be the wrong names: in another block than `blocks`, it leaves next to nothing of what they
-    leave, and foretells recordings left out better; in place of one effect it must be as simple. None elsewhere.
+    leave, or no more than `MANY` do, and foretells recordings left out better; in place of one effect it must be as simple. None
+    elsewhere.
 
     `base`: the plain fit; `named`: that with the effects, their `number`.
     """
@@ -312,7 +314,8 @@ def better_learned(base, named, blocks, recordings, bench, number: int = 1, prog
     if learned is None or learned.place.block in blocks or not (number > 1 or learned.place.simple):
         return None
     left, least = (r.chi2_per_sample - AT_NOISE for r in (learned.result, named))
-    far = left > WRONG_NAME * least or learned.left_out[1] > left_out(named.problem, named.solution).mean()
+    share = WRONG_NAME if number < MANY else 1.0
+    far = left > share * least or learned.left_out[1] > left_out(named.problem, named.solution).mean()
     return None if far else learned
 
 
