@@ -87,6 +87,9 @@ def _absorb(state, value):
         array = np.ascontiguousarray(value)
         _mark(state, "array", f"{array.dtype.str}{np.shape(value)}")
         state.update(array.tobytes())
+    elif hasattr(value, "tocoo"):  # sparse, as scipy has it
+        entries = value.tocsc()
+        _absorb(state, ("sparse", entries.shape, entries.data, entries.indices, entries.indptr))
     elif callable(value) and hasattr(value, "__qualname__"):
         _mark(state, "function", _name(value))
     else:
