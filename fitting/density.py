@@ -86,7 +86,7 @@ class DensityBasis:
     @functools.cached_property
     def hats(self) -> Hats:
         """The unknowns as programs and `Layout` have them."""
-        entries = self.cells.tocsc().tocoo()
+        entries = self.cells.tocoo()
         places, unknowns = (jax.device_put(k.astype(np.int32)) for k in entries.coords)
         return Hats(on_device(entries.data), places, unknowns, self.size)
 

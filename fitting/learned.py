@@ -33,7 +33,10 @@ WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned fu
 MANY = 3  # effects in place of which a function that leaves no more is the better word: so many at once are seldom missing
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
-BASE_LOSSES = {("coil", "flux_rate"): "R_eddy", ("mechanics", "displacement_rate"): "xi"}
+BASE_LOSSES = {  # of the base, that act as a constant times a rate
+    ("coil", "flux_rate"): ("coil.R_eddy", "coil.k_eddy", "effects.eddy_currents.k"),
+    ("mechanics", "displacement_rate"): ("mechanics.xi",),
+}
 GRID = 121
 BEYOND = 0.25  # of the range seen, shown on either side of it
 
@@ -185,7 +188,7 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
 def band(learned: Learned, *values):
     """The learned function and its standard deviation at some values of its variables, unit of the block's output.
 
-    Centred on the range seen, for a constant is not told from the base; of a function times a rate whose loss the base has
+    Centred on the range seen, for a constant is not told from the base; of a function times a rate whose loss is fitted
     (`_taken_up`) its mean at each rate. Beyond the range the deviation grows with the distance as the slope of the prior does.
     """
     term = learned.term
@@ -193,7 +196,7 @@ def band(learned: Learned, *values):
     waves, outside = (np.asarray(x) for x in term.basis(*values, xp=np))
     shape = waves.shape[1:]
     rows = waves.reshape(len(waves), -1)
-    if _taken_up(term):
+    if _taken_up(learned):
         along = np.linspace(float(term.low[0]), float(term.high[0]), 41)[:, None]
         middle = term.basis(*np.broadcast_arrays(along, values[1].ravel()), xp=np)[0].mean(axis=1)
     else:
@@ -209,9 +212,11 @@ def band(learned: Learned, *values):
     return value.reshape(shape), size * np.sqrt(np.maximum(variance, 0.0)).reshape(shape)
 
 
-def _taken_up(term) -> str | None:
-    """The constant of the base that takes up the mean of a function times a rate: the eddy resistance, the damping."""
-    return BASE_LOSSES.get((term.place, *term.variables[1:])) if term.counts[1:] == (1,) else None
+def _taken_up(learned: Learned) -> str | None:
+    """The fitted constant that takes up the mean of a function times a rate: the eddy resistance, the damping."""
+    term = learned.term
+    rival = BASE_LOSSES.get((term.place, *term.variables[1:]), ()) if term.counts[1:] == (1,) else ()
+    return next((name for name in rival if name in learned.result.problem.layout.names), None)
 
 
 @kept
@@ -290,7 +295,7 @@ def described(learned: Learned) -> dict:
     return {
         "variables": named(learned.place), "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
-        "mean_in": _taken_up(term), "left_out": list(learned.left_out), "bends_over": learned.place.length,
+        "mean_in": _taken_up(learned), "left_out": list(learned.left_out), "bends_over": learned.place.length,
         "function": {"x": x.tolist(), "slices": slices},
         "boundaries": [
             {

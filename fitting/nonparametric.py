@@ -147,7 +147,7 @@ class Tangents:
 
     def __init__(self, result):
         self.problem, self.solution = result.problem, result.refined
-        self.actuator = self.problem.layout.actuator(self.problem.template, jnp.asarray(self.solution.z))
+        self.actuator = self.problem.layout.actuator(self.problem.template, np.asarray(self.solution.z))
         self.predictor = self.problem.predictors[0]
         self.projector = Projector(self.problem, self.solution)
         self.fine = self.problem.predictors[1]  # a sharp function needs its samples

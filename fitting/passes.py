@@ -169,7 +169,7 @@ class Passes:
         layout, part, offset = self.problem.layout, columns[0] // COLUMNS, np.zeros(COLUMNS)
         hats = self.held is None and part < len(self.problem.tables)
         if hats:
-            offset += self.total * np.asarray(self.problem.tables[part][:, -1, 0])
+            offset += self.total * np.asarray(self.problem.tables[part])[:, -1, 0]
         if layout.density_unknowns in columns:
             offset[layout.density_unknowns - columns[0]] = self.total
         masses, values = (layout.hats.each(columns[0]), self.problem.tables[part]) if hats else self.none

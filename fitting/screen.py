@@ -171,7 +171,7 @@ def _changes(classes, trials, predictor, actuator):
 
 def columns(problem, z):
     """First-order change of the whitened misfit by every applicable effect: list of (class, shapes, column)."""
-    actuator = problem.layout.actuator(problem.template, jnp.asarray(z))
+    actuator = problem.layout.actuator(problem.template, np.asarray(z))
     predictor = problem.predictors[0]
     classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
     drives = [np.asarray(d) for d in predictor.drives]

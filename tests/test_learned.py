@@ -229,11 +229,14 @@ def test_the_band_of_a_loss_leaves_to_the_base_what_is_its_own(block, rate):
     loose = known.copy()
     loose[0, 0] = 50.0**2  # the first wave is the constant
     m, at = np.linspace(-6e5, 6e5, 41), np.full(41, 120.0)
-    value, wide = band(Learned(place, term, None, loose, (5.0, 1.1), 0.9), m, at)
-    assert wide == pytest.approx(band(Learned(place, term, None, known, (5.0, 1.1), 0.9), m, at)[1], rel=1e-6)
+    free = types.SimpleNamespace(problem=types.SimpleNamespace(layout=types.SimpleNamespace(names=("coil.R_eddy", "mechanics.xi"))))
+    value, wide = band(Learned(place, term, free, loose, (5.0, 1.1), 0.9), m, at)
+    assert wide == pytest.approx(band(Learned(place, term, free, known, (5.0, 1.1), 0.9), m, at)[1], rel=1e-6)
     assert value.mean() == pytest.approx(0.0, abs=1e-9) and np.ptp(value) > 10 * wide.max()
     elsewhere = dataclasses.replace(term, place="sensor", variables=("magnetization", "reading_rate"))  # no constant of the base
-    assert band(Learned(place, elsewhere, None, loose, (5.0, 1.1), 0.9), m, at)[1].max() > 100
+    assert band(Learned(place, elsewhere, free, loose, (5.0, 1.1), 0.9), m, at)[1].max() > 100
+    held = types.SimpleNamespace(problem=types.SimpleNamespace(layout=types.SimpleNamespace(names=("mechanics.f0",))))
+    assert band(Learned(place, term, held, loose, (5.0, 1.1), 0.9), m, at)[1].max() > 100  # a constant that is not fitted takes up nothing
 
 
 class FieldKink(AbstractEffect):

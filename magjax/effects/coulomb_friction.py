@@ -71,9 +71,9 @@ def _settled(passed, steady, law, reach, f, mechanics, held, displacement):
         def step(carry, here):  # number by number: a product of matrices stands in the way of the compiler
             x, y, p = carry  # own motion and its rate, share
             share, by_free, by_share = here
-            free, y = a * x + b * y + first[0] * p, c * x + d * y + first[1] * p
-            now = share + by_free * (free - x) + by_share * p
-            return (free + last[0] * now, y + last[1] * now, now), now
+            rest, y = a * x + b * y + first[0] * p, c * x + d * y + first[1] * p
+            now = share + by_free * (rest - x) + by_share * p
+            return (rest + last[0] * now, y + last[1] * now, now), now
 
         linear = jnp.concatenate([displacement[-1:], displacement])
         share = _share(free, before, reach, law, moved) + by_free * (jnp.diff(linear) - free) - by_share * before

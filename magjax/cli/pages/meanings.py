@@ -105,7 +105,7 @@ INNER = {
     "unknown.variable_units": "their units",
     "unknown.unit": "unit of what the function adds at the block",
     "unknown.share": "share of the excess misfit that the learned term takes, 0 .. 1",
-    "unknown.mean_in": "constant of the base that takes up the mean of a function times a rate, R_eddy or xi; null elsewhere",
+    "unknown.mean_in": "fitted constant that takes up the mean of a function times a rate, `coil.R_eddy` or `mechanics.xi`; null elsewhere",
     "unknown.rms": "rms of the function over the range seen, less its mean, or what `mean_in` takes up",
     "unknown.seen": "range of each variable in the recordings, [low, high]",
     "unknown.left_out": "chi2 per datum of recordings left out one at a time, [without, with the term]",
