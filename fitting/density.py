@@ -110,7 +110,7 @@ def hat_basis(
     low: float,
     high: float,
     total: float,
-    level: int = 80,
+    level: int = 120,
     knots_s: int = 18,
     knots_r: int = 13,
     crowd: float = 1.0,
@@ -236,23 +236,29 @@ def held_basis(hysteresis, total: float) -> DensityBasis:
 
 
 @functools.lru_cache(maxsize=2)
-def cell_basis(low: float, high: float, total: float, level: int) -> DensityBasis:
-    """One unknown a cell, the form of T&B Sec. 2.1, with the once-switching column; penalties along s and r."""
-    size = level + 2
+def cell_basis(low: float, high: float, total: float, level: int, number: int | None = None) -> DensityBasis:
+    """One unknown a cell, the form of T&B Sec. 2.1, with the once-switching column; penalties along s and r.
+
+    `number` of cells along the plane, a divisor of `level`, which it is where None: each is so many of the level's in a square.
+    """
+    number = level if number is None else number
+    size, side, main = level + 2, level // number, number * (number + 1) // 2
     area = level * level / 2
-    inner = [(i, j) for i in range(level) for j in range(i + 1)]
-    number, main = {pair: k for k, pair in enumerate(inner)}, len(inner)
-    places = [(i + 1) * size + j + 1 for i, j in inner]
-    places += [(i + 1) * size for i in range(level)] + [(size - 1) * size + i + 1 for i in range(level)]
-    shares = [(0.5 if i == j else 1.0) / area for i, j in inner] + [1.0 / level] * (2 * level)
-    cells = csc_array((shares, (places, range(len(places)))), (size * size, len(places)))
-    along_s = [[number.get((i + d, j + d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
-    along_r = [[number.get((i + d, j - d)) for d in (-1, 0, 1)] for i in range(level) for j in range(i + 1)]
-    once = _triples(main, level) + _triples(main + level, level)
+    i, j = np.tril_indices(level)
+    at = i // side * (i // side + 1) // 2 + j // side
+    edge = np.arange(level)
+    rows = np.concatenate([(i + 1) * size + j + 1, (edge + 1) * size, (size - 1) * size + edge + 1])
+    columns = np.concatenate([at, main + edge // side, main + number + edge // side])
+    shares = np.concatenate([np.where(i == j, 0.5, 1.0) / area, np.full(2 * level, 1.0 / level)])
+    cells = csc_array((shares, (rows, columns)), (size * size, main + 2 * number))
+    own = {pair: k for k, pair in enumerate(zip(*np.tril_indices(number), strict=True))}
+    along_s = [[own.get((i + d, j + d)) for d in (-1, 0, 1)] for i, j in own]
+    along_r = [[own.get((i + d, j - d)) for d in (-1, 0, 1)] for i, j in own]
+    once = _triples(main, number) + _triples(main + number, number)
     penalties = tuple(
         _differences(t, cells.shape[1], ridge) for t, ridge in ((along_s, ()), (along_r, ()), (once, range(main, cells.shape[1])))
     )
     flat = np.ones(cells.shape[1])
     flat[main:] = 0.05
     step = (high - low) / level
-    return DensityBasis(low - step, high + step, size, cells, penalties, total, flat, level, level)
+    return DensityBasis(low - step, high + step, size, cells, penalties, total, flat, number, number)

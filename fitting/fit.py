@@ -20,14 +20,14 @@ from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, field_of_
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
-CELLS = tuple({"knots": None, "level": level} for level in (32, 40))  # a mass a cell: a rough density may need them
-FINER = (  # densities tried where the misfit asks for them, those of one step side by side; of one level: they share programs
-    ({"knots": (26, 18), "level": 120},),
-    ({"knots": (36, 24), "level": 120}, *CELLS),
-    ({"knots": (48, 32), "level": 120},),
+CELLS = tuple({"knots": None, "cells": cells} for cells in (30, 40))  # a mass a cell: a rough density may need them
+FINER = (  # densities tried where the misfit asks for them, those of one step side by side
+    ({"knots": (26, 18)},),
+    ({"knots": (36, 24)}, *CELLS),
+    ({"knots": (48, 32)},),
 )
 FINER_MATERIAL = (  # where the field is known loops are steep, and cells too wide
-    ({"knots": (26, 18), "level": 104},),
+    ({"knots": (26, 18), "level": 144},),
     ({"knots": (36, 24), "level": 144},),
     (),
 )

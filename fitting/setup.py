@@ -26,11 +26,13 @@ REACH = 30.0  # times the bench's value, or that part of it: as far as a positiv
 
 @dataclasses.dataclass(frozen=True)
 class Choices:
-    """How a fit is set up. `level`: cells along the plane; `knots`: hats in s and r, None for one unknown a cell;
+    """How a fit is set up. `level`: cells along the plane, the same for all densities, so that these share programs; `knots`:
+    hats in s and r, None for one unknown a cell, of `cells` along the plane (a divisor of the level; None: all of them);
     `coarse`, `fine`: samples a period for the Jacobian and for the residual; `periods`: simulated, the last used."""
 
-    level: int = 80
+    level: int = 120
     knots: tuple[int, int] | None = (18, 13)
+    cells: int | None = None
     coarse: int = 125
     fine: int = 500
     periods: int = 3
@@ -128,7 +130,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
                 "name hysteresis.masses in fit.free, or leave out the recordings beyond"
             )
     elif choices.knots is None:
-        basis = cell_basis(low - margin, high + margin, total, choices.level)
+        basis = cell_basis(low - margin, high + margin, total, choices.level, choices.cells)
     else:
         crowd = 1.7 if bench.drive == "field" else 1.0
         level = 2 * choices.level if known_field else choices.level

@@ -255,9 +255,22 @@ def test_linear_rows_are_the_operator(make):
     assert np.tensordot(x, every[: basis.unknowns], 1) == pytest.approx(masses) and not every[basis.unknowns :].any()
 
 
-def test_finer_hats_share_their_programs():
-    """What is compiled depends on the level of the plane alone."""
-    assert len({row["level"] for step in FINER for row in step if row["knots"]}) == 1
+def test_cells_of_many_are_the_same_density():
+    """On whatever plane: uniform over a cell, uniform over each of those that it is cut into."""
+    rng = np.random.default_rng(3)
+    field, bases = rng.uniform(-100, 900, 60), (cell_basis(-100.0, 900.0, 2.0, 24, 6), cell_basis(-100.0, 900.0, 2.0, 6))
+    x = rng.random(bases[0].unknowns)
+    found, expected = (
+        np.asarray(Preisach(b.masses(x), b.low, b.high, float(b.masses(x).sum())).magnetization(field, corners=60)) for b in bases
+    )
+    assert found == pytest.approx(expected, abs=1e-12) and np.ptp(found) > 1
+    assert [a.shape for a in bases[0].penalties] == [b.shape for b in bases[1].penalties]
+
+
+def test_all_densities_share_their_programs():
+    """What is compiled depends on the level of the plane alone, and that is one for all."""
+    assert {row.get("level", Choices().level) for step in FINER for row in step} == {Choices().level}
+    assert all(Choices().level % row["cells"] == 0 for step in FINER for row in step if "cells" in row)
 
 
 def test_bounded_minimum_meets_the_optimality_conditions():
