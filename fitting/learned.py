@@ -89,8 +89,9 @@ def left_out(problem, solution) -> np.ndarray:
     return np.asarray(rows)
 
 
-def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
-    """Fit a place's term jointly with density, parameters and adopted effects of a `FitResult`."""
+def fit_term(base, place: Place, recordings, bench, progress=None, target: float = np.inf) -> Learned:
+    """Fit a place's term jointly with density, parameters and adopted effects of a `FitResult`; `target`: a chi2 above which it is of
+    no use, and foretells nothing."""
     say = progress or (lambda *a: None)
     n = base.problem.layout.density_unknowns
     names = (*base.problem.layout.names, *(f"effects.learned_term.{c}" for c in place.term.parameters()))
@@ -105,8 +106,9 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
             z[n + 1 : n + 1 + len(names)] = moved  # noqa: F821
         solution = solve(
             problem, z, weights, max_jacobians=choices.max_jacobians,
-            progress=lambda k, c: say(f"learning {place.joined(str)} at the {place.block}", k, c),
+            progress=lambda k, c: say(f"learning {place.joined(str)} at the {place.block}", k, c), target=target,
         )  # fmt: skip
+        missed = solution.chi2 > target
         if solution.interrupted:
             raise KeyboardInterrupt
         first = problem.layout.index(names[len(base.problem.layout.names)])
@@ -120,7 +122,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
         deviation = np.asarray(term.deviation)
         known = np.clip(1 - np.diag(spread) / deviation**2, 0.0, 1.0)  # of each coefficient, how much is the data's word
         factor = float(np.clip(np.sqrt(np.sum((values / deviation) ** 2) / max(known.sum(), 0.5)), 0.05, 20.0))
-        if again or 1 / RESIZED < factor < RESIZED:
+        if again or missed or 1 / RESIZED < factor < RESIZED:
             break
         term = dataclasses.replace(term, size=term.size * factor)
         moved = solution.z[n + 1 : n + 1 + len(names)].copy()
@@ -129,12 +131,12 @@ def fit_term(base, place: Place, recordings, bench, progress=None) -> Learned:
         kept = {name: float(problem.layout.value(name, jnp.asarray(start))) for name in base.problem.layout.names}
         moved[: len(kept)] = 0.0
         base = dataclasses.replace(base, actuator=base.actuator.replace(kept))
-    result = finish(problem, solution, choices, bench, recordings)
+    result = finish(problem, solution, choices, bench, recordings, target=target)
     fitted = result.actuator.effect("learned_term")
     after = result.chi2_per_sample * result.data_count
     share = (before - after) / max(before - result.data_count, 1e-9)
     widened = spread * WIDEN**2 * max(result.chi2_per_sample, 1.0)
-    others = (float(left_out(base.problem, base.solution).mean()), float(left_out(problem, solution).mean()))
+    others = (float(left_out(base.problem, base.solution).mean()), np.inf if missed else float(left_out(problem, solution).mean()))
     return Learned(place, fitted, result, widened, others, float(np.clip(share, 0.0, 1.0)))
 
 
@@ -162,8 +164,8 @@ def _needless(place, tried) -> bool:
     return same or any(place.evidence < CLOSE * t.place.evidence for t in met)
 
 
-def learn(base, recordings, bench, progress=None) -> Learned | None:
-    """The term that serves best beside a fit, or None where none foretells left-out recordings better."""
+def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Learned | None:
+    """The term that serves best beside a fit, or None where none foretells left-out recordings better, or comes below the `target`."""
     say = progress or (lambda *a: None)
     let_go()
     places = [p for p in locate_places(base, say) if p.evidence > 0]
@@ -173,7 +175,7 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
     for place in chosen_places(places):
         if not _needless(place, tried):
             let_go()
-            tried.append(fit_term(base, place, recordings, bench, progress))
+            tried.append(fit_term(base, place, recordings, bench, progress, target))
     tried = sorted((t for t in tried if np.isfinite(t.result.chi2_per_sample)), key=lambda t: t.left_out[1])
     if not tried or not tried[0].worth:
         return None
@@ -181,7 +183,7 @@ def learn(base, recordings, bench, progress=None) -> Learned | None:
     # of those that serve as well, the one that the rest of the model hides least: another must be larger to be seen as much
     best, *others = sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: -t.place.visibility)
     rivals = tuple(t.place for t in others)
-    fits = tuple((t.place, float(t.result.chi2_per_sample), float(t.left_out[1])) for t in tried)
+    fits = tuple((t.place, float(t.result.chi2_per_sample), float(t.left_out[1]) if np.isfinite(t.left_out[1]) else None) for t in tried)
     return dataclasses.replace(best, places=tuple(places), rivals=rivals, tried=fits)
 
 
@@ -315,12 +317,11 @@ def better_learned(base, named, blocks, recordings, bench, number: int = 1, prog
 
     `base`: the plain fit; `named`: that with the effects, their `number`.
     """
-    learned = learn(base, recordings, bench, progress)
+    most = AT_NOISE + (WRONG_NAME if number < MANY else 1.0) * max(named.chi2_per_sample - AT_NOISE, 0.0)  # chi2/N
+    learned = learn(base, recordings, bench, progress, most * named.data_count)
     if learned is None or learned.place.block in blocks or not (number > 1 or learned.place.simple):
         return None
-    left, least = (r.chi2_per_sample - AT_NOISE for r in (learned.result, named))
-    share = WRONG_NAME if number < MANY else 1.0
-    far = left > share * least or learned.left_out[1] > left_out(named.problem, named.solution).mean()
+    far = learned.result.chi2_per_sample > most or learned.left_out[1] > left_out(named.problem, named.solution).mean()
     return None if far else learned
 
 

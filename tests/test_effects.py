@@ -216,8 +216,11 @@ def test_strong_friction_of_a_little_damped_rod_is_settled(frequency, monkeypatc
 @pytest.mark.parametrize(
     "effect",
     [
-        effects.StressFeedback(stiffness=3e11), effects.ExcessLoss(k=80.0, rate_knee=0.1), effects.RateDependentSwitching(gamma=60.0, rate0=1e3),
-        effects.MagneticAftereffect(share=0.1), effects.MeanField(alpha=8e-3),
+        effects.ExcessLoss(k=80.0, rate_knee=0.1), effects.StressFeedback(stiffness=3e11),
+        *(
+            pytest.param(effect, marks=pytest.mark.long)
+            for effect in (effects.RateDependentSwitching(gamma=60.0, rate0=1e3), effects.MagneticAftereffect(share=0.1), effects.MeanField(alpha=8e-3))
+        ),
     ],
     ids=lambda e: e.name,
 )  # fmt: skip
@@ -237,7 +240,7 @@ def test_steps_with_an_effect_settle_as_bracketed_ones_do(effect, monkeypatch):
     assert np.abs(H - bracketed).max() < 5e-5 and max(np.abs(left).max(), np.abs(left_there).max()) < 5e-5  # of 1e4 A/m
 
 
-@pytest.mark.parametrize("frequency", [40.0, 175.0])
+@pytest.mark.parametrize("frequency", [pytest.param(40.0, marks=pytest.mark.long), 175.0])
 def test_the_derivative_of_friction_is_that_of_all_passes(frequency):
     """By the force, its presliding, the rod and the drive: it is taken from the last pass and what that makes of a period's begin."""
     act = dataclasses.replace(actuator(20), mechanics=Mechanics(jnp.asarray(500.0), jnp.asarray(0.055)))

@@ -3,7 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
@@ -61,9 +61,9 @@ def test_what_is_expected_is_the_spread_of_predictions(bench, null, plain):
     known = _known(plain.solution, layout)
     root = np.linalg.cholesky(known + 1e-14 * np.eye(len(z)) * np.trace(known) / len(z))
 
+    @jax.jit
     def lines(y):
-        actuator = layout.actuator(problem.template, jnp.asarray(y))
-        return np.asarray(predictor(actuator, layout.levels(jnp.asarray(y))[: len(spectra)]))
+        return predictor(layout.actuator(problem.template, y), layout.levels(y)[: len(spectra)])
 
     def draw():
         change = step * root @ rng.standard_normal(len(z))

@@ -308,3 +308,27 @@ def test_the_prediction_is_less_sure_beyond_what_was_seen():
     inside = prediction_interval(learned, 0.3 * np.sin(phase), 1 / 2500)[1]
     beyond = prediction_interval(learned, 0.8 * np.sin(phase), 1 / 2500)[1]
     assert beyond.max() > 5 * inside.max() > 0
+
+
+@pytest.mark.parametrize("counts", [(7,), (5, 4), (6, 1)])
+def test_the_series_is_the_sum_of_its_cosines(counts):
+    """By a recurrence, with a derivative of its own; inside the range seen and beyond it."""
+    rng = np.random.default_rng(0)
+    ends = np.array([[-2.0, 3.0], [-40.0, 50.0]])[: len(counts)]
+    knee, ones = np.array([0.0, 4.0])[: len(counts)], np.ones(int(np.prod(counts)))
+    term = LearnedTerm.null(
+        "coil", ("magnetization", "flux_rate")[: len(counts)], *ends.T, counts, ones, 3.0, knee,
+        beyond=rng.standard_normal(2 * len(counts)), coefficients=rng.standard_normal(len(ones)),
+    )  # fmt: skip
+    at = tuple(jnp.asarray(rng.uniform(1.3 * low, 1.3 * high, 30)) for low, high in ends)
+
+    def summed(term, *at):
+        waves, outside = term.basis(*at)
+        return term.size * (jnp.stack(term.coefficients) @ waves + term.beyond @ outside)
+
+    towards = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), (term, *at))
+    found, expected = (jax.jvp(f, (term, *at), towards) for f in (lambda term, *at: term.value(*at), summed))
+    for a, b in zip(found, expected, strict=True):
+        assert np.asarray(a) == pytest.approx(np.asarray(b), rel=1e-11, abs=1e-11)
+    held = jax.jvp(lambda *at: term.value(*at), at, towards[1:])[1]  # no coefficient moves
+    assert np.asarray(held) == pytest.approx(np.asarray(jax.jvp(lambda *at: summed(term, *at), at, towards[1:])[1]), rel=1e-11, abs=1e-11)

@@ -43,7 +43,7 @@ def some(*frequencies, noise=2):
     return [record(concealed_actuator(load_bench("aa-050h")), f, 0.6, 0.0, rng, f"{f}") for f in frequencies]
 
 
-@pytest.mark.parametrize("rest", ["negative", "demagnetized"])
+@pytest.mark.parametrize("rest", [pytest.param("negative", marks=pytest.mark.long), "demagnetized"])
 def test_they_are_those_of_the_whole_chain(rest):
     """Seven recordings on two grids, more unknowns than go through at once, effects on either side of the hysteresis."""
     recordings = [modulated(concealed_actuator(load_bench("aa-050h"))), *some(20, 50, 90, 120, 150, 200)]

@@ -60,7 +60,13 @@ def _choice(boundary, unknown) -> str:
         return "kept"
     if _place(boundary) in map(_place, unknown["rivals"]):
         return "not told from it"
-    return "" if "left_out" not in boundary else "not tried" if boundary["left_out"] is None else "tried, worse"
+    return "" if "left_out" not in boundary else "tried, worse" if _tried(boundary) else "not tried"
+
+
+def _tried(boundary) -> bool:
+    """Whether a function was fitted there; it may have been given up before it foretold anything."""
+    chi2 = boundary.get("chi2_per_sample")
+    return chi2 is not None and bool(np.isfinite(chi2))
 
 
 def _boundaries(unknown):
@@ -69,7 +75,7 @@ def _boundaries(unknown):
     columns = [tables.aligned([[b.get(key)] for b in boundaries]) for key in ("chi2_per_sample", "left_out")]
     rows = []
     for rank, (b, chi2, left_out) in enumerate(zip(boundaries, *columns, strict=True)):
-        if rank < SHOWN or b.get("left_out") is not None or _place(b) == kept:
+        if rank < SHOWN or _tried(b) or _place(b) == kept:
             first_order = [b["block"], _joined(b["variables"]), plain(b["evidence"]), percent(b["share"]), percent(b["visibility"])]
             rows.append([*first_order, *((*chi2, *left_out) if told else ()), _choice(b, unknown)])
     note = (

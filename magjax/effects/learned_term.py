@@ -7,8 +7,10 @@ predicts what it cannot explain, and states how far its function is known.
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from ..param import ParameterInfo, as_float_array
@@ -29,6 +31,49 @@ PLACES = {
     "sensor": ("reading", "reading_rate", "current", "current_rate"),
 }
 OUTPUTS = {"source": "A", "coil": "A/m", "hysteresis": "A/m", "magnetostriction": "m", "mechanics": "m", "sensor": "reading"}
+
+
+def _products(counts, along, xp):
+    """Every product of cosines of multiples of the angles `along`, (coefficients, ...); a variable of one wave is a factor."""
+    product = None
+    for at, count in zip(along, counts, strict=True):
+        waves = at[None] if count == 1 else xp.cos(xp.arange(count).reshape((count,) + (1,) * at.ndim) * at)
+        product = waves if product is None else (product[:, None] * waves[None]).reshape((-1, *at.shape))
+    return product
+
+
+def _recurred(counts, coefficients, along):
+    """The sum of coefficients times `_products`, by C. W. Clenshaw's recurrence (Math. Tables Aids Comput. 9 (1955) 118): one cosine a
+    variable."""
+    rows = coefficients.reshape(*counts, *(1,) * jnp.ndim(along[0]))
+    for at, count in zip(along, counts, strict=True):  # whose rows come first of those that are left
+        if count == 1:
+            rows = rows[0] * at
+            continue
+        twice, here, before = 2 * jnp.cos(at), 0.0, 0.0
+        for row in rows[:0:-1]:
+            here, before = row + twice * here - before, here
+        rows = rows[0] + 0.5 * twice * here - before
+    return rows
+
+
+_series = jax.custom_jvp(_recurred, nondiff_argnums=(0,))
+
+
+def _changed(counts, given, tangents):
+    """The sum and its change: by a slope for each angle, by the cosines for the coefficients, both known before a direction is."""
+    (coefficients, along), (by_coefficients, by_angle) = given, tangents
+    value, change = _recurred(counts, coefficients, along), 0.0
+    for k, (at, towards) in enumerate(zip(along, by_angle, strict=True)):
+        if type(towards) is not SymbolicZero:
+            there = lambda x, k=k: _recurred(counts, coefficients, (*along[:k], x, *along[k + 1 :]))  # noqa: E731
+            change = change + jax.jvp(there, (at,), (jnp.ones_like(at),))[1] * towards
+    if type(by_coefficients) is not SymbolicZero:
+        change = change + jnp.tensordot(by_coefficients, _products(counts, along, jnp), 1)
+    return value, change + jnp.zeros_like(value)
+
+
+_series.defjvp(_changed, symbolic_zeros=True)
 
 
 class LearnedTerm(AbstractEffect):
@@ -103,27 +148,33 @@ class LearnedTerm(AbstractEffect):
         """Every product of cosines at some values, (coefficients, ...), and the scaled distances beyond, (ends, ...).
 
         `xp`: jax.numpy or numpy."""
-        product, outside = None, []
+        along, outside = self._scaled(values, xp)
+        return _products(self.counts, along, xp), xp.stack(outside)
+
+    def _scaled(self, values, xp):
+        """Of every variable the angle of its first cosine, or what it is as a factor; and the scaled distances beyond."""
+        along, outside = [], []
         for x, low, high, knee, count in zip(values, self.low, self.high, self.knee, self.counts, strict=True):
             low, high, knee = (xp.asarray(v) for v in (low, high, knee))
             if count == 1:
-                x = x / xp.maximum(xp.abs(low), xp.abs(high))
+                along.append(x / xp.maximum(xp.abs(low), xp.abs(high)))
                 outside += [xp.zeros_like(x)] * 2
-                product = x[None] if product is None else product * x[None]
                 continue
             width = xp.where(knee > 0, knee, 1.0)
             x, low, high = (xp.where(knee > 0, xp.arcsinh(v / width), v) for v in (x, low, high))
             s = (x - low) / (high - low)
             outside += [xp.maximum(-s, 0.0), xp.maximum(s - 1.0, 0.0)]
-            angle = (xp.clip(s, 0.0, 1.0) + PAD) * (np.pi / (1 + 2 * PAD))
-            waves = xp.cos(xp.arange(count).reshape((count,) + (1,) * angle.ndim) * angle)
-            product = waves if product is None else (product[:, None] * waves[None]).reshape((-1, *angle.shape))
-        return product, xp.stack(outside)
+            along.append((xp.clip(s, 0.0, 1.0) + PAD) * (np.pi / (1 + 2 * PAD)))
+        return along, outside
 
     def value(self, *values):
-        """The function at some values of its variables, unit of the block's output."""
-        waves, outside = self.basis(*values)
-        return self.size * (jnp.tensordot(jnp.stack(self.coefficients), waves, 1) + jnp.tensordot(self.beyond, outside, 1))
+        """The function at some values of its variables, unit of the block's output.
+
+        A step asks for it many times: see `_series`.
+        """
+        along, outside = self._scaled(values, jnp)
+        series = _series(self.counts, jnp.stack(self.coefficients), tuple(along))
+        return self.size * (series + sum(b * x for b, x in zip(self.beyond, outside, strict=True)))
 
     def _of(self, table):
         return self.value(*(table[v]() for v in self.variables))

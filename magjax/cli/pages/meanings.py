@@ -124,7 +124,7 @@ INNER = {
     "unknown.boundaries[].share": "share of the misfit that it explains to first order",
     "unknown.boundaries[].visibility": "share of its columns that density and constants cannot make",
     "unknown.boundaries[].chi2_per_sample": "misfit with a function there fitted jointly with all else; null where it was not tried",
-    "unknown.boundaries[].left_out": "the same of recordings left out one at a time",
+    "unknown.boundaries[].left_out": "the same of recordings left out one at a time; null where it was given up, for it came nowhere near",
     "unknown.rivals": "boundaries that serve as well once fitted",
     "unknown.rivals[].block": "block",
     "unknown.rivals[].variables": "variables",
