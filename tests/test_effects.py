@@ -137,7 +137,7 @@ def test_friction_against_its_equation_in_time(f, v_s, presliding, stribeck, tol
 
 
 @pytest.mark.parametrize("effect", [
-    effects.DuffingStiffness(k3=2.0, k5=0.2, rest=0.1), effects.DuffingStiffness(k3=-0.15), effects.DeltaE(e=0.8, static=0.7), effects.DeltaE(e=-0.5),
+    effects.DuffingStiffness(k3=2.0, k5=0.2, rest=0.1), effects.DuffingStiffness(k3=-0.15), effects.DeltaE(e=0.8, static=0.7, bend=0.6), effects.DeltaE(e=-0.5),
 ], ids=["stiffens", "softens", "gives way", "stays"])  # fmt: skip
 @pytest.mark.parametrize("periodic", [True, False])
 def test_a_strong_spring_of_a_lightly_damped_rod_against_its_equation_in_time(effect, periodic):
@@ -157,7 +157,8 @@ def test_a_strong_spring_of_a_lightly_damped_rod_against_its_equation_in_time(ef
         return 0.4 + 0.3 * np.sin(2 * np.pi * f * t - 0.4)
 
     if effect.name == "delta_e":
-        force = lambda t, y: -float(effect.e) * square(t) * (y - (1 - float(effect.static)) * free(t))
+        stiffer = lambda t: float(effect.e) * square(t) * (1 + float(effect.bend) * (1 - square(t)))
+        force = lambda t, y: -stiffer(t) * (y - (1 - float(effect.static)) * free(t))
     else:
         ratio = lambda y: y / reach - float(effect.rest)
         force = lambda t, y: -reach * float(effect.k3) * ratio(y) ** 3 * (1 + float(effect.k5) * ratio(y) ** 2)
@@ -377,7 +378,8 @@ def test_details_of_a_law_are_held_until_they_are_asked_for():
     assert friction.free_parameters() == ("f", "v_s", "presliding")
     finer = friction.in_detail()
     assert set(finer.free_parameters()) == set(friction.parameters()) and float(finer.stribeck) > 0 and float(finer.f) == 1e-6
-    assert finer.in_detail() is None and effects.DeltaE().in_detail() is None
+    assert finer.in_detail() is None and effects.TransportDelay().in_detail() is None
+    assert float(effects.DeltaE(e=0.1, static=0.4).in_detail().bend) > 0
     assert "exponent" not in effects.Creep().free_parameters() and float(effects.Creep().in_detail().exponent) != 0
 
 
