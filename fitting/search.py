@@ -43,7 +43,7 @@ from .verdict import FAR_FROM_NOISE, HALF, SILENT_CHI2, Z_THRESHOLD
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
-LITTLE_LEFT = 0.05  # share of a chi2/N that an effect may leave for a finer density to be tried beside it, however far that is
+LITTLE_LEFT = 0.2  # share of a chi2/N that an effect may leave for a finer density to be tried beside it, however far that is
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
 LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
 IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise

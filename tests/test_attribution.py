@@ -202,11 +202,12 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
 
 @pytest.mark.parametrize(
     ("before", "left", "asked"),
-    [(6760.0, 204.0, 338.0), (1000.0, 204.0, None), (100.0, 20.0, 30.0)],
-    ids=["little of it", "much of it", "not far"],
+    [(6760.0, 204.0, 1352.0), (1172.0, 136.0, 234.4), (1000.0, 204.0, None), (100.0, 20.0, 30.0)],
+    ids=["little of it", "some of it", "much of it", "not far"],
 )
 def test_a_finer_density_is_tried_beside_what_takes_nearly_all(monkeypatch, before, left, asked):
-    """A sensor's curve beside an excess_loss on blocks: 6760 to 204, and 9.7 with finer hats, where the loss shows."""
+    """A sensor's curve beside an excess_loss on blocks: 6760 to 204, and 9.7 with finer hats, where the loss shows; a strain_hysteresis on
+    ridges: 1172 to 136, and 2.3."""
     best, limits = trial("sensor_nonlinearity", left, base=before), []
     best.result.actuator, best.result.spectra = SimpleNamespace(effects=()), None
     found = SimpleNamespace(choices=Choices(rest="negative"))
