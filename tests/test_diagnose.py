@@ -179,30 +179,30 @@ def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(mo
 ])  # fmt: skip
 def test_masses_of_cells_or_finer_hats_serve_a_final_model_where_they_promise_to_foretell_better(bench, monkeypatch, left, by_cells, taken):
     """And are not asked for where hats leave little."""
-    now, levels = a_fit(left, 60.0), []
-    now.choices, now.spectra, now.unknowns = Choices(knots=(26, 18), level=120), (), 30.0
+    now, asked = a_fit(left, 60.0), []
+    now.choices, now.spectra, now.unknowns = Choices(knots=(26, 18)), (), 30.0
     now.bench, now.problem = bench, SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy", "sensor.offset")))
-    fits = dict(zip((32, 40, 120), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))
+    fits = dict(zip((30, 40, None), (a_fit(c, 60.0) for c, _ in by_cells), strict=False))  # None: of hats
     for found, (_, unknowns) in zip(fits.values(), by_cells, strict=True):
         found.unknowns = unknowns
     monkeypatch.setattr(
-        Task, "fit", lambda task, actuator, choices, extra, **more: levels.append((choices.level, extra)) or fits[choices.level]
+        Task, "fit", lambda task, actuator, choices, extra, **more: asked.append((choices.cells, extra)) or fits[choices.cells]
     )
     evidence = evidence_of([], now, now, (), {})
     found = rough_module.by_cells(Task((), bench), evidence)
-    assert sorted(levels) == [(level, ("sensor.offset",)) for level in sorted(fits)] and (found and found.excess) == taken
+    assert sorted(asked, key=str) == [(cells, ("sensor.offset",)) for cells in fits] and (found and found.excess) == taken
 
 
 @pytest.mark.parametrize(
     ("chi2n", "cells", "beside", "rough"),
     [
-        (1.65, {32: (1.32, 60), 40: (1.5, 60)}, None, True),
-        (1.65, {32: (1.5, 60), 40: (1.6, 60)}, None, False),  # physics: cells do not come near the noise
-        (1.5, {32: (1.32, 200), 40: (1.4, 200)}, None, False),  # nor do they foretell better
-        (3.5, {32: (1.3, 60), 40: (1.4, 60)}, None, False),
-        (1.22, {32: (1.26, 60), 40: (1.4, 60)}, 1.17, True),
-        (1.22, {32: (1.26, 60), 40: (1.4, 60)}, 1.05, False),  # the effect takes most of what cells leave
-        (1.1, {32: (1.26, 60), 40: (1.4, 60)}, 1.17, False),  # the effect meets the noise
+        (1.65, {30: (1.32, 60), 40: (1.5, 60)}, None, True),
+        (1.65, {30: (1.5, 60), 40: (1.6, 60)}, None, False),  # physics: cells do not come near the noise
+        (1.5, {30: (1.32, 200), 40: (1.4, 200)}, None, False),  # nor do they foretell better
+        (3.5, {30: (1.3, 60), 40: (1.4, 60)}, None, False),
+        (1.22, {30: (1.26, 60), 40: (1.4, 60)}, 1.17, True),
+        (1.22, {30: (1.26, 60), 40: (1.4, 60)}, 1.05, False),  # the effect takes most of what cells leave
+        (1.1, {30: (1.26, 60), 40: (1.4, 60)}, 1.17, False),  # the effect meets the noise
     ],
     ids=["rough", "too much is left", "no better", "far off", "an effect by chance", "an effect", "an effect that meets the noise"],
 )
@@ -218,15 +218,15 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
         return SimpleNamespace(chi2_per_sample=value, data_count=700, unknowns=unknowns, choices=Choices(knots=knots), **common)
 
     plain, current = result(1.6 if beside else chi2n, 100, (26, 18)), result(chi2n, 100, (26, 18))
-    fits = {level: result(*row) for level, row in cells.items()}
-    monkeypatch.setattr(Task, "fit", lambda task, actuator, choices, **more: fits[choices.level])
+    fits = {number: result(*row) for number, row in cells.items()}
+    monkeypatch.setattr(Task, "fit", lambda task, actuator, choices, **more: fits[choices.cells])
     monkeypatch.setattr(Task, "fit_on", lambda *arguments, **more: result(beside, 61))
     steps = [trial("mean_field", current, 200.0)] if beside else []
     reached = Reached(current, steps, {})
     evidence = dataclasses.replace(evidence_of([], plain, plain, (), {}), reached=reached)
     found = rough_module.on_cells_alone(Task((), bench), evidence)
     assert (found is not None) == rough
-    assert not rough or (found.raw is found.plain is found.reached.current is fits[32] and not found.reached.steps)
+    assert not rough or (found.raw is found.plain is found.reached.current is fits[30] and not found.reached.steps)
 
 
 DROPS = {"second_mode": 1500.0, "mean_field": 1400.0, "transport_delay": 900.0, "backlash": 300.0}
@@ -350,7 +350,7 @@ def test_effects_are_held_against_means_on_the_density_that_these_got(monkeypatc
     own = RecordEffect("zero_drift", 90.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
     monkeypatch.setattr(signals_module, "zeros_of", lambda *a: [own])
     base, freed, beside = a_fit(9.4, 55.0), a_fit(1.0, 60.0), a_fit(5.7, 56.0)
-    for found, choices in ((base, Choices()), (freed, Choices(knots=(26, 18), level=120)), (beside, Choices(knots=(26, 18), level=120))):
+    for found, choices in ((base, Choices()), (freed, Choices(knots=(26, 18))), (beside, Choices(knots=(26, 18)))):
         found.choices, found.problem, found.refined, found.spectra, found.data_count = choices, None, None, None, 1000
     monkeypatch.setattr(Task, "fit", lambda task, actuator: freed)
     monkeypatch.setattr(Task, "fit_on", lambda task, start, actuator, spectra: beside if start is freed else None)

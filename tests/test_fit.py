@@ -106,7 +106,7 @@ def test_a_density_of_blocks_is_met_by_finer_hats():
 
 def test_finer_densities_are_tried_in_steps(bench):
     hats, rough, finest = finer_than(Choices(), bench)
-    assert [c.knots for c in hats] == [(26, 18)] and [(c.knots, c.level) for c in rough[1:]] == [(None, 32), (None, 40)]
+    assert [c.knots for c in hats] == [(26, 18)] and [(c.knots, c.cells) for c in rough[1:]] == [(None, 30), (None, 40)]
     assert finer_than(hats[0], bench) == ((), rough, finest) and finer_than(rough[1], bench) == ((), (), ())
     assert rough[0].knots == (36, 24) and finer_than(rough[0], bench) == ((), (), finest) and finest[0].knots == (48, 32)
     assert (
