@@ -415,13 +415,15 @@ def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:
             else "the simulation fails at its constants"
         )
         return f"the fit has led nowhere: {size} (worst: {named}); {wrong}"
+    bound = [e.name for e in parameters if e.at_bound and not e.name.startswith("effects.")]  # where a law's shape ends it may stay
     if not solution.converged:
         after = f"stopped after {solution.jacobians} Jacobians before it settled"
+        if bound:
+            return f"{after}: {', '.join(bound)} sits at its bound; free another parameter or check signs, units and the bench file"
         if limit is not None and solution.jacobians < limit:
             return f"{after}: no step leads on from there; start nearer, hold a parameter or give it a prior (see the bench file)"
         return f"{after}; raise --max-jacobians or start nearer (see the bench file)"
     worst = max(rows, key=lambda r: r.chi2_per_sample)
-    bound = [e.name for e in parameters if e.at_bound and not e.name.startswith("effects.")]  # where a law's shape ends it may stay
     if bound:
         far = f", and what repeats is {np.sqrt(chi2n):.3g} times its noise (worst: {Path(worst.file).name})" if chi2n > 2 else ""
         return f"{', '.join(bound)} sits at its bound{far}; free another parameter or check signs, units and the bench file"

@@ -1,6 +1,7 @@
 """A piezo stack on the bench: voltage plays the field, polarization the magnetization, and everything speaks volts and metres."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -78,7 +79,7 @@ def test_play_operators_are_fitted_to_their_noise_and_a_held_out_loop_is_foretol
 
 def test_everything_speaks_volts_and_metres(fitted, folder, capsys, tmp_path):
     content, out = fitted
-    page = (out / "report.html").read_text()
+    page = re.sub(r"base64,[A-Za-z0-9+/=\s]*", "", (out / "report.html").read_text())  # pictures hold any letters
     assert "A/m" not in page and "magneti" not in page and "voltage / V" in page and "displacement / µm" in page
     assert "A/m" not in json.dumps(content)
     assert main(["check", str(folder / "pz_0.csv"), "--bench", "piezo-stack"]) == 0
