@@ -205,7 +205,9 @@ def test_ctrl_c_at_odd_moments(emulate, tmp_path, seconds, number):
         return
     child.send_signal(number)
     out, err = child.communicate(timeout=60)
-    assert child.returncode == 130 and "Traceback" not in out + err and "Exception" not in err, err
+    # a Ctrl-C that lands in an import's exec of a string ends the process by the signal itself, whoever answers it: a shell says 130, too
+    ended = (130,) if seconds is None else (130, -signal.SIGINT)
+    assert child.returncode in ended and "Traceback" not in out + err and "Exception" not in err, err
     assert seconds is not None or ("interrupted" in err or "asked to end" in err) and "drive at zero: confirmed" in err
     assert drive_at_zero(device["port"])
     if path.exists():
