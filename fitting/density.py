@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csc_array, csr_array, hstack, vstack
 
+from magjax.errors import ConfigurationError
+
 R_EXPONENT = 1.6
 TAIL = 0.5
 RIDGE = 0.3  # beside second differences
@@ -242,6 +244,8 @@ def cell_basis(low: float, high: float, total: float, level: int, number: int | 
     `number` of cells along the plane, a divisor of `level`, which it is where None: each is so many of the level's in a square.
     """
     number = level if number is None else number
+    if level % number:
+        raise ConfigurationError(f"cells = {number} does not divide the plane's {level} levels; take a divisor, or set level to a multiple")
     size, side, main = level + 2, level // number, number * (number + 1) // 2
     area = level * level / 2
     i, j = np.tril_indices(level)

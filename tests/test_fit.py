@@ -265,6 +265,8 @@ def test_cells_of_many_are_the_same_density():
     )
     assert found == pytest.approx(expected, abs=1e-12) and np.ptp(found) > 1
     assert [a.shape for a in bases[0].penalties] == [b.shape for b in bases[1].penalties]
+    with pytest.raises(ConfigurationError, match="does not divide"):
+        cell_basis(-100.0, 900.0, 2.0, 24, 7)
 
 
 def test_all_densities_share_their_programs():

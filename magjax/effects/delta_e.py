@@ -27,7 +27,7 @@ class DeltaE(AbstractEffect):
         typical=(0.0, 1.0),
     )
     bend: Float[Array, ""] = param(
-        0.0, "1", "0: as m^2, 1: early, with none of it left at saturation", low=-1.0, high=1.0, scale=0.3, shape=True, detail=True, typical=(-0.5, 1.0)
+        0.0, "1", "0: even in m^2, 1: early, and level towards saturation", low=-1.0, high=1.0, scale=0.3, shape=True, detail=True, typical=(-0.5, 1.0)
     )
 
     name = "delta_e"
