@@ -29,12 +29,14 @@ MOST = 300_000_000  # bytes on disk; beyond, those that were used longest ago go
 OWN = ("magjax", "fitting")
 IN_MEMORY: list[dict] = []  # the programs of every function
 COMPILING = threading.RLock()  # one heavy program at a time: to compile it takes up to a gigabyte
+COMPILER = {"xla_cpu_use_fusion_emitters": False}  # with them a program takes twice as long to compile, and runs no faster
 HEAVY = 77_000  # bytes of what is compiled, more than the plain chain's programs have
 
 
 def kept(function):
     """As `equinox.filter_jit`, for a function of modules, arrays and constants that returns arrays in tuples, lists, dicts and modules."""
-    plain, known, locks = eqx.filter_jit(function), {}, {}
+    within, known, locks = eqx.filter_jit(function), {}, {}
+    alone = functools.cache(lambda: eqx.filter_jit(function, compiler_options=compiler_options()))
     IN_MEMORY.append(known)
 
     @functools.wraps(function)
@@ -42,8 +44,10 @@ def kept(function):
         folder = jax.config.jax_compilation_cache_dir
         arrays, constants = eqx.partition(arguments, lambda x: isinstance(x, jax.Array | np.ndarray))
         leaves, tree = jax.tree.flatten(arrays)
-        if not folder or any(isinstance(x, jax.core.Tracer) for x in leaves):
-            return plain(*arguments)
+        if any(isinstance(x, jax.core.Tracer) for x in leaves):
+            return within(*arguments)
+        if not folder:
+            return alone()(*arguments)
         values, other = jax.tree.flatten(constants)
         key = (tree, other, tuple(values), tuple((x.shape, str(x.dtype)) for x in leaves))
         program = known.get(key)  # another thread may `forget` it
@@ -53,13 +57,23 @@ def kept(function):
                 if program is None:
                     program = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
                     with COMPILING if getattr(program, "heavy", False) else contextlib.nullcontext():
-                        found = program(leaves) if program else plain(*arguments)
+                        found = program(leaves) if program else alone()(*arguments)
                     trim()
                     known[key] = program
                     return found
-        return program(leaves) if program else plain(*arguments)
+        return program(leaves) if program else alone()(*arguments)
 
     return call
+
+
+@functools.cache
+def compiler_options() -> dict:
+    """`COMPILER`, or nothing where this machine's compiler does not know them."""
+    try:
+        jax.jit(lambda x: x, compiler_options=COMPILER).lower(0.0).compile()
+    except Exception:
+        return {}
+    return COMPILER
 
 
 def forget() -> None:
@@ -95,10 +109,11 @@ def _program(function, arguments, constants, key, leaves, folder):
         _write(path, lasting)
     # on one device whatever the arguments come from: else each mixture of new arrays and results is compiled anew
     device = jax.config.jax_default_device or jax.local_devices()[0]
-    run = jax.jit(exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device))
+    run = jax.jit(exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device), compiler_options=compiler_options())
 
     def program(leaves):
-        return _filled(form, jax.tree.leaves(run(*leaves)))
+        with jax.ensure_compile_time_eval():  # also where another program is traced meanwhile, for which this is a constant
+            return _filled(form, jax.tree.leaves(run(*leaves)))
 
     program.heavy = len(exported.mlir_module_serialized) > HEAVY
     return program

@@ -1,11 +1,18 @@
 """Double precision, one thread for the small dense solves, a compilation cache shared by the run's workers."""
 
 import os
+import signal
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: what is interrupted here would not notice
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):  # a compiler that does not know a flag ends the process
+    # as the programs of fits have it (`magjax.programs.COMPILER`): half of the time to compile
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax
 import pytest
