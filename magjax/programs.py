@@ -167,7 +167,15 @@ def _read(path):
 
     form, program = zlib.decompress(path.read_bytes()).split(b"\n", 1)
     os.utime(path)
+    _find_lapack()
     return json.loads(form), export.deserialize(bytearray(program))
+
+
+@functools.cache
+def _find_lapack() -> None:
+    """Let jax look up LAPACK, which it does where an operation of it is lowered; a program that was lowered in another process would
+    call a null pointer."""
+    jax.jit(jax.numpy.linalg.inv).lower(jax.ShapeDtypeStruct((1, 1), float))
 
 
 def _write(path, content: bytes) -> None:

@@ -1,5 +1,7 @@
 """Programs kept between processes: read where nothing has changed, traced where anything has."""
 
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -53,6 +55,23 @@ def test_a_program_is_read_and_not_traced_again(folder):
     scaled(line, values, 3.0), scaled(line, jnp.ones((2, 6)), 2.0), scaled(Timeline(jnp.asarray(0.5), 7, True), values, 2.0)
     scaled(Timeline(jnp.asarray(0.5), 6, False), values, 2.0), scaled(line, values, 2.0, values)
     assert len(TRACED) == 6 == len(list(folder.iterdir()))
+
+
+BY_LAPACK = """
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_compilation_cache_dir", {folder!r})
+jax.config.update("jax_enable_x64", True)
+from fitting.model import on_device
+from magjax import linear, programs
+print(np.asarray(programs.kept(linear.inverse_of)(on_device(2.0 * np.eye(3))))[0, 0], len(programs.IN_MEMORY[-1]))
+"""
+
+
+def test_a_program_that_was_read_finds_lapack(folder):
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", BY_LAPACK.format(folder=str(folder.parent))], capture_output=True, text=True)
+        assert (done.returncode, done.stdout.split()) == (0, ["0.5", "1"]), done.stderr
+        assert len(list(folder.glob("*.program"))) == 1
 
 
 def test_it_gives_what_the_traced_one_gives(folder):
