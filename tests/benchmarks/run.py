@@ -195,6 +195,51 @@ def joint_fit():
     }  # fmt: skip
 
 
+COMPILED = """
+import json, sys, time
+from magjax import programs
+from magjax.cli.runtime import prepare_jax
+prepare_jax()
+if sys.argv[1] == "usual":
+    programs.COMPILER.clear()
+import magjax.effects as effects
+from fitting.joint import data_jacobian, data_residual
+from fitting.setup import Choices, build_problem, effect_parameters, free_parameters, spectra_of
+from magjax.bench import load_bench
+from tests.studies.joint_fit import SINES, one_draw, settled
+recordings, _ = one_draw(settled("gauss"), 0)
+bench, found = load_bench("aa-050h"), []
+spectra = spectra_of(recordings[: len(SINES)], bench)
+for held in ((), (effects.StressFeedback(),), (effects.CoulombFriction(f=3e-8), effects.ExcessLoss(k=10.0))):
+    actuator = bench.actuator()
+    for effect in held:
+        actuator = actuator.with_effect(effect)
+    problem, z = build_problem(spectra, actuator, bench, free_parameters(bench, actuator, effect_parameters(actuator)), Choices(rest="negative"))
+    times = []
+    for _ in range(4):
+        begin = time.process_time()
+        data_residual(problem, z), data_jacobian(problem, z)
+        times.append(time.process_time() - begin)
+    found.append((times[0] - min(times), min(times)))
+print(json.dumps(found))
+"""
+
+
+def compiler():
+    """A residual and its Jacobian traced and compiled as `magjax.programs.COMPILER` asks, over the same as the compiler does by itself."""
+    rows = {}
+    for way in ("ours", "usual"):
+        with tempfile.TemporaryDirectory() as cache:
+            command = [sys.executable, "-c", COMPILED, way]
+            done = subprocess.run(command, env={**os.environ, "MAGJAX_CACHE": cache}, check=True, capture_output=True, text=True)
+            rows[way] = json.loads(done.stdout)
+    found = {}
+    for name, ours, usual in zip(("plain", "stress_feedback", "friction and excess_loss"), rows["ours"], rows["usual"], strict=True):
+        found[f"{name}: processor time until it runs, over the usual"] = ours[0] / usual[0]
+        found[f"{name}: that of a run, over the usual"] = ours[1] / usual[1]
+    return found
+
+
 def grid():
     """200 x 20 sweep to steady state against the same with the compiled serial loop; memory above jax's and xarray's imports."""
     import xarray  # noqa: F401  (56 MB that the result's library takes, whatever is swept)
@@ -265,6 +310,7 @@ GROUPS = {
     "inversion": inversion,
     "l1": l1,
     "fit": joint_fit,
+    "compiler": compiler,
 }
 
 
