@@ -10,6 +10,7 @@ import numpy as np
 from .attribute import (
     BIC_DROP,
     CLOSE,
+    COMPANIONS,
     FEEDBACKS,
     MIN_DROP,
     MISFIT,
@@ -167,7 +168,33 @@ def _trials(task, current, top, candidates, excess) -> list[Trial]:
         like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]
     for k in range(0, len(like), SIDE_BY_SIDE):
         attempt(like[k : k + SIDE_BY_SIDE])
-    return _on_equal_terms(task, current, trials, excess)
+    return _on_equal_terms(task, current, _led(task, current, trials, excess), excess)
+
+
+def _led(task, current, trials, excess) -> list[Trial]:
+    """The trials; where one meets the noise, its kin that ended in a misfit are fitted from where it ended, too: the density under
+    it is the right one, and that of the current fit, which has bent to what is missing, may hold them far off."""
+    ahead = min(trials, key=lambda t: np.nan_to_num(chi2_of(t.result), nan=np.inf), default=None)
+    if ahead is None or not ahead.result.chi2_per_sample < SETTLED_CHI2:
+        return trials
+    kin = COMPANIONS.get(ahead.name, ())
+    far = [t for t in trials if t.result.chi2_per_sample > MISFIT and t.name != ahead.name and (t.name in kin or of_one_family(t, ahead))]
+    if not far:
+        return trials
+    target = chi2_of(ahead.result) + 2 * WEAK_TIE[1]
+    base = ahead.result.actuator.without_effect(ahead.name)
+
+    def from_there(t):
+        effect = t.result.actuator.effect(t.name)
+
+        def one(say):
+            result = task.on(progress=say).fit_on(ahead.result, base.with_effect(effect), choices=ahead.result.choices, target=target)
+            return credited(t.candidate, result, current, effect, excess)
+
+        return one
+
+    better = {t.name: t for t in together([from_there(t) for t in far], task.progress)}
+    return [min(t, better.get(t.name, t), key=lambda t: np.nan_to_num(chi2_of(t.result), nan=np.inf)) for t in trials]
 
 
 def _on_equal_terms(task, current, trials, excess) -> list[Trial]:

@@ -335,12 +335,18 @@ def test_a_sensors_curve_is_as_large_as_its_departure_over_the_motion(curve, rea
         (CLASSES["coulomb_friction"](f=2e-5, v_s=1e-3, presliding=1e-6), True),
         (CLASSES["coulomb_friction"](f=2e-5, v_s=0.2, presliding=1e-6), False),
         (CLASSES["coulomb_friction"](f=2e-5, v_s=1e-3, presliding=3e-5), False),
+        (CLASSES["second_eddy_path"](kappa=0.95, tau=7e-5, air=1.0), True),
+        (CLASSES["second_eddy_path"](kappa=1.17, tau=7e-5, air=1.0), False),
+        (CLASSES["second_eddy_path"](kappa=1.17, tau=7e-5, air=0.1), True),
     ],
-    ids=["a mode", "two lags", "a spring", "a spring near its stop", "a stop", "friction", "a damper", "a spring with losses"],
+    ids=[
+        "a mode", "two lags", "a spring", "a spring near its stop", "a stop", "friction", "a damper", "a spring with losses",
+        "a sleeve round the coil", "the current late", "a sleeve round the rod",
+    ],
 )
 def test_a_law_bent_into_another_is_not_named(effect, physical):
     """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop, friction that
-    is viscous throughout a delay beside a creep."""
+    is viscous throughout a delay beside a creep, a turn round the coil that opposes more than its field an amplifier's lag of two poles."""
     assert _physical(effect, a_fit_of((0.0, 5e-5))) is physical
 
 
@@ -740,6 +746,33 @@ def test_rivals_that_meet_the_noise_are_compared_with_the_details_of_their_laws(
     asked.clear()  # nothing to compare with, or the best does not meet the noise: settled by itself
     assert fitting.search._on_equal_terms(Task((), None), None, trials[:1], 1000.0) == trials[:1]
     assert fitting.search._on_equal_terms(Task((), None), None, trials[2:3], 1000.0) == trials[2:3] and not asked
+
+
+def test_kin_of_what_meets_the_noise_are_fitted_from_where_it_ended(monkeypatch):
+    """Whatever it is worth itself: an eddy path that no turn can be led to an amplifier's lag, which from the base's density ended at 20."""
+    actuator = SimpleNamespace(
+        without_effect=lambda name: SimpleNamespace(with_effect=lambda effect: effect), effect=lambda name: SimpleNamespace(name=name, free_parameters=tuple)
+    )
+    trials = [
+        trial("second_eddy_path", 0.97, physical=False), trial("amplifier_lag", 20.0, direction=(0, 1, 0)), trial("sensor_lag", 1.2, direction=(0, 1, 0)),
+        trial("creep", 20.0, direction=(0, 1, 0)), trial("backlash", 20.0),
+    ]  # fmt: skip
+    for t in trials:
+        t.result.actuator, t.result.choices = actuator, Choices()
+    ended = {"amplifier_lag": 0.96, "backlash": 25.0}
+    asked = []
+
+    def fit_on(task, start, effect, **more):
+        asked.append((effect.name, start is trials[0].result))
+        found = trial(effect.name, ended[effect.name]).result
+        found.actuator = SimpleNamespace(effects=())
+        return found
+
+    monkeypatch.setattr(Task, "fit_on", fit_on)
+    found = fitting.search._led(Task((), None), trial("creep", 3.0).result, trials, 1000.0)
+    assert sorted(asked) == [("amplifier_lag", True), ("backlash", True)]
+    assert [t.result.chi2_per_sample for t in found] == [0.97, 0.96, 1.2, 20.0, 20.0]
+    assert fitting.search._led(Task((), None), None, trials[1:2], 1000.0) == trials[1:2] and len(asked) == 2
 
 
 @pytest.mark.parametrize(

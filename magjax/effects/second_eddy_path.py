@@ -35,6 +35,10 @@ class SecondEddyPath(AbstractEffect):
     in_step = True
     slow = True
 
+    def is_itself(self) -> bool:
+        """Not where a turn round the coil opposes more field than the coil makes: then it is a lag of all that the current does."""
+        return bool(self.kappa * self.air <= 1)
+
     def start(self, trial, actuator):
         """No current flows: its field over kappa, what drives it, the applied field, the integral of the drive."""
         zero = jnp.zeros_like(trial.field)
