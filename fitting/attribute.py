@@ -122,7 +122,7 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
         result = task.fit_on(base, actuator, target=target)
         if not chi2_of(result) < chi2_of(base) and chi2_of(base) - candidate.z**2 < target:
             nearer = effect.with_amplitude(amplitude * _no_farther(candidate, base))
-            result = min(result, task.fit_on(base, base.actuator.with_effect(nearer), target=target), key=_finite_chi2)
+            result = min(result, task.fit_on(base, base.actuator.with_effect(nearer), target=target), key=finite_chi2)
     return credited(candidate, result, base, effect, excess)
 
 
@@ -132,7 +132,8 @@ def _no_farther(candidate, base) -> float:
     return min(0.3, float(np.sqrt(max(excess_of(base), MIN_DROP))) / max(alone, 1e-9))
 
 
-def _finite_chi2(result) -> float:
+def finite_chi2(result) -> float:
+    """Total chi2 of a fit, infinite where it has failed."""
     return chi2_of(result) if np.isfinite(result.chi2_per_sample) else np.inf
 
 

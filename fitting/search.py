@@ -24,6 +24,7 @@ from .attribute import (
     credited,
     excess_of,
     family,
+    finite_chi2,
     in_detail,
     leaders,
     of_one_family,
@@ -174,7 +175,7 @@ def _trials(task, current, top, candidates, excess) -> list[Trial]:
 def _led(task, current, trials, excess) -> list[Trial]:
     """The trials; where one meets the noise, its kin that ended in a misfit are fitted from where it ended, too: the density under
     it is the right one, and that of the current fit, which has bent to what is missing, may hold them far off."""
-    ahead = min(trials, key=lambda t: np.nan_to_num(chi2_of(t.result), nan=np.inf), default=None)
+    ahead = min(trials, key=lambda t: finite_chi2(t.result), default=None)
     if ahead is None or not ahead.result.chi2_per_sample < SETTLED_CHI2:
         return trials
     kin = COMPANIONS.get(ahead.name, ())
@@ -194,7 +195,7 @@ def _led(task, current, trials, excess) -> list[Trial]:
         return one
 
     better = {t.name: t for t in together([from_there(t) for t in far], task.progress)}
-    return [min(t, better.get(t.name, t), key=lambda t: np.nan_to_num(chi2_of(t.result), nan=np.inf)) for t in trials]
+    return [min(t, better.get(t.name, t), key=lambda x: finite_chi2(x.result)) for t in trials]
 
 
 def _on_equal_terms(task, current, trials, excess) -> list[Trial]:
