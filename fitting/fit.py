@@ -165,29 +165,47 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
 
         return one
 
-    def serves(known, found):
-        # levels that strain their prior tell of a wrong start memory even where the recordings are met
-        levels = found.z[len(found.z) - known.layout.memories :]
-        calm = float(levels @ levels) <= CALM * len(levels)
-        return calm and found.chi2 < REST_SETTLED * known.data_count, found.chi2 + float(levels @ levels)
-
     ended = [run(rests[0], (problem, z))(report)]
-    if not serves(*ended[0][:2])[0] and not ended[0][1].interrupted:
+    if not _settled(*ended[0][:2]) and not ended[0][1].interrupted:
         try:
             ended += together([run(rest) for rest in _apart((*rests, *others), problem)[1:]], report)
         except KeyboardInterrupt:
             known, found, tried = ended[0]
             ended = [(known, dataclasses.replace(found, converged=False, interrupted=True), tried)]
-    best = None
-    for known, found, tried in ended:
-        settled, score = serves(known, found)
-        if tried.rest in others and not settled:
-            continue
-        if best is None or score < best[3]:
-            best = (known, found, tried, score)
-        if settled:
-            break
-    return best[:3]
+    return _best_memory([row for row in ended if row[2].rest not in others or _settled(*row[:2])])
+
+
+def _strain(problem, solution) -> float:
+    """Sum of the squared levels of the recordings, each in units of its prior: a wrong start memory strains them."""
+    levels = solution.z[len(solution.z) - problem.layout.memories :]
+    return float(levels @ levels)
+
+
+def _settled(problem, solution) -> bool:
+    """Whether no other start memory need be tried; levels that strain their prior tell of a wrong one even where the recordings
+    are met."""
+    return _strain(problem, solution) <= CALM * problem.layout.memories and solution.chi2 < REST_SETTLED * problem.data_count
+
+
+def against_memory(fits) -> list[float]:
+    """What speaks against the start memory of each fit of the same recordings: pairs of a problem and its solution.
+
+    Chi2 and the levels' strain where the noise is met. What a density too coarse, or missing physics, leaves acts as further
+    noise of the harmonics, as large as the best leaves: that one memory leaves a little less of it than another tells nothing,
+    for each density bends to it in its own way. The levels of the right memory stay calm meanwhile; those of others are off by tens of
+    their prior.
+    """
+    noise = max(1.0, min((found.chi2 / known.data_count for known, found in fits if np.isfinite(found.chi2)), default=1.0))
+    against = [found.chi2 / noise + _strain(known, found) for known, found in fits]
+    return [value if np.isfinite(value) else np.inf for value in against]
+
+
+def _best_memory(ended):
+    """Of fits from several start memories, (problem, solution, choices), the first that is settled, else the best."""
+    for row in ended:
+        if _settled(*row[:2]):
+            return row
+    return ended[int(np.argmin(against_memory([row[:2] for row in ended])))]
 
 
 def _with_turning(z, solution, actuator, bench, names, choices, spectra, report, target):

@@ -35,7 +35,7 @@ from .attribute import (
 )
 from .check import check_errors
 from .exchange import backward, commuted, exchange
-from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, rests_of
+from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, against_memory, rests_of
 from .foretold import Foreteller
 from .rows import SLOW
 from .screen import screened
@@ -304,7 +304,8 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
     if any_rest and len(order) > 1 and (chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED):
         other = task.fit_on(best.result, best.result.actuator, choices=free)
         margin = MIN_DROP if order.index(other.choices.rest) < order.index(chosen.rest) else -MIN_DROP
-        if chi2_of(other) < chi2_of(best.result) + margin:
+        against = against_memory([(fit.problem, fit.solution) for fit in (other, best.result)])
+        if against[0] < against[1] + margin:
             found = other.choices
     highest = max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
     if any_density and chosen.knots is not None and FINER_FROM[0] < best.result.chi2_per_sample < highest:

@@ -162,18 +162,24 @@ def test_what_takes_less_than_half_of_the_rest_is_not_named(base, after, named):
 
 
 @pytest.mark.parametrize(
-    ("held", "found", "chi2n", "taken"),
-    [("demagnetized", "negative", 1.01, True), ("demagnetized", "negative", 1.10, False), ("demagnetized", "positive", 0.98, False),
-     ("demagnetized", "positive", 0.90, True)],
-    ids=["as good", "worse", "hardly better", "better"],
+    ("held", "found", "chi2n", "strain", "taken"),
+    [("demagnetized", "negative", 1.01, 0, True), ("demagnetized", "negative", 1.10, 0, False), ("demagnetized", "positive", 0.98, 0, False),
+     ("demagnetized", "positive", 0.90, 0, True), ("demagnetized", "positive", 0.90, 9, False)],
+    ids=["as good", "worse", "hardly better", "better", "better, and its levels are off"],
 )  # fmt: skip
-def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, held, found, chi2n, taken):
+def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, held, found, chi2n, strain, taken):
     import fitting.search as module
     from magjax.bench import load_bench
 
     best = trial("sensor_lag", 1.0)
     best.result.estimates, best.result.actuator, best.result.spectra = (), None, ()
-    other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found))
+    problem = SimpleNamespace(data_count=COUNT, layout=SimpleNamespace(memories=2))
+
+    def ended(chi2n, level):
+        return {"problem": problem, "solution": SimpleNamespace(chi2=chi2n * COUNT, z=np.array([7.0, level, level]))}
+
+    vars(best.result).update(ended(1.0, 0.0))
+    other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found), **ended(chi2n, strain))
     before = SimpleNamespace(chi2_per_sample=50.0, data_count=COUNT)
     again, spoiled = [], []
 

@@ -1,13 +1,14 @@
 """What relays remember that a recording never reaches: start states, the static path, the fit that finds them."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from fitting.density import hat_basis
-from fitting.fit import fit
+from fitting.fit import _best_memory, fit
 from fitting.recipe import lag_recipe
 from fitting.setup import Choices
 from fitting.starts import unreached_row
@@ -149,3 +150,25 @@ def test_the_recipe_of_section_2_3():
         lag_recipe(made[:1], actuator, [60.0, 70.0])
     with pytest.raises(ConfigurationError, match="mesh"):
         lag_recipe(made, actuator, [70.0])
+
+
+@pytest.mark.parametrize(
+    ("ended", "best"),
+    [
+        ({"demagnetized": (427.3, 981.0), "negative": (462.2, 2.9), "positive": (440.0, 9000.0)}, "negative"),  # a coarse density's misfit
+        ({"negative": (1.0, 1.0), "demagnetized": (1.3, 0.0)}, "negative"),  # the noise is met: its harmonics count in full
+        ({"negative": (1.0, 400.0), "demagnetized": (1.3, 0.0)}, "demagnetized"),
+        ({"negative": (9.0, 0.1), "demagnetized": (1.05, 0.1), "positive": (1.04, 0.1)}, "demagnetized"),  # the first that is settled
+        ({"negative": (np.nan, np.nan), "demagnetized": (50.0, 3.0)}, "demagnetized"),
+        ({"negative": (np.inf, 0.0)}, "negative"),
+    ],
+    ids=["coarse", "at the noise", "strained", "settled", "failed", "alone"],
+)
+def test_the_levels_tell_the_start_memory_where_much_is_amiss(ended, best):
+    known = SimpleNamespace(data_count=648, layout=SimpleNamespace(memories=8))
+
+    def row(name, chi2n, strain):
+        z = np.append(np.ones(5), np.full(8, np.sqrt(strain)))
+        return known, SimpleNamespace(chi2=648 * chi2n, z=z), Choices(rest=name)
+
+    assert _best_memory([row(name, *found) for name, found in ended.items()])[2].rest == best
