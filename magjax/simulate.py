@@ -48,6 +48,7 @@ class Signals(eqx.Module):
 
 
 MOST_SWEPT = 10_000_000  # steady states of a sweep, or kept samples: 0.6 GB of results
+CHUNK, GPU_CHUNK = 512, 40_000  # steady states at a time; fewer leave most of a GPU idle (`python -m tests.studies.gpu`)
 MOST_PERIODS = 250  # a drive that has not settled by then is told as it is
 TOLERANCE = 1e-8  # of a single steady state; a sweep asks for less
 
@@ -213,15 +214,15 @@ def _refuse_outside(actuator, lowest, highest, where=""):
 
 def sweep(
     actuator, frequencies, amplitudes, offsets=(0.0,), *, samples: int = 250, settle: int | None = None, tolerance: float = 3e-4,
-    chunk: int = 512, keep=False, executor=None, checkpoint=None, progress=None,
+    chunk: int | None = None, keep=False, executor=None, checkpoint=None, progress=None,
 ):  # fmt: skip
     """Steady states for a grid of biased sines, as a labelled xarray Dataset.
 
     `frequencies` Hz, `amplitudes` and `offsets` in the unit of the drive; `settle` and `tolerance` as in `simulate`
     (where a small loop creeps, three to four times the tolerance may be left). Returns
     peak-to-peak and mean reading, amplitude and phase of its fundamental, loss per cycle (not of a stack under voltage), and `unsettled`, how much the last
-    two periods differ; `keep=True` adds the waveforms. The grid is run in chunks of `chunk` trajectories, so memory does not
-    grow with it, each over the devices that JAX sees; `executor`, `checkpoint` and `progress` as in `magjax.scale.run_job`:
+    two periods differ; `keep=True` adds the waveforms. The grid is run in chunks of `chunk` trajectories (`CHUNK`, or on a GPU
+    `GPU_CHUNK`, if None), so memory does not grow with it, each over the devices that JAX sees; `executor`, `checkpoint` and `progress` as in `magjax.scale.run_job`:
     the numbers are the same to the last bit for any of them. Raises `ConfigurationError` for a frequency that is not above
     zero, a drive outside the plane, or a lost corner.
     """
@@ -245,6 +246,8 @@ def sweep(
     start = actuator.hysteresis.history.shape[0] // 2
     corners = int(4 * np.ceil((4 + start) / 4))
     total = len(grid[0])
+    if chunk is None:
+        chunk = CHUNK if jax.default_backend() == "cpu" else GPU_CHUNK
     chunk = min(chunk, total)
     chunks = []
     for begin in range(0, total, chunk):

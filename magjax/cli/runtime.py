@@ -11,12 +11,18 @@ from magjax.errors import ConfigurationError
 from .waiting import tell
 
 
-def prepare_jax() -> None:
-    """Double precision and a compilation cache that outlives the run."""
+def prepare_jax(many: bool = False) -> None:
+    """Double precision and a compilation cache that outlives the run; on the processor, unless `JAX_PLATFORMS` says otherwise.
+
+    `many`: thousands of trajectories side by side, which go to a GPU where there is one. A fit is a chain of short steps: there it
+    takes as long, and its programs twice as long to compile (docs/scale.md).
+    """
     gc.set_threshold(50_000, 20, 20)  # traced programs are millions of objects that stay: to look through them takes a second
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    if not many and not jax.config.jax_platforms:
+        jax.config.update("jax_platforms", "cpu")
     cache = Path(os.environ.get("MAGJAX_CACHE", Path.home() / ".cache" / "magjax"))
     try:
         cache.mkdir(parents=True, exist_ok=True)

@@ -134,7 +134,7 @@ def run_sweep(arguments) -> int:
     import numpy as np
 
     executor = executor_of(options)
-    prepare_jax()
+    prepare_jax(many=True)
     actuator, _ = _actuator(options)
     path = _target(options.out)
     from magjax.simulate import MOST_PERIODS, sweep

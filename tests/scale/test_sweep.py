@@ -67,6 +67,39 @@ def test_several_devices(plain, tmp_path):
             assert found[name].values == pytest.approx(plain[name].values, rel=1e-12)
 
 
+@pytest.mark.parametrize(("backend", "count"), [("cpu", 2), ("gpu", 1)])
+def test_a_gpu_takes_larger_chunks(monkeypatch, backend, count):
+    jobs = []
+
+    def run_job(job, *a, **k):
+        jobs.append(job)
+        raise InterruptedError
+
+    monkeypatch.setattr("magjax.simulate.run_job", run_job)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    with pytest.raises(InterruptedError):
+        sweep(load_bench("aa-050h").actuator(), np.linspace(10.0, 300.0, 60), np.linspace(0.1, 0.8, 10))
+    assert len(jobs[0].chunks) == count
+
+
+PLATFORMS = """
+import jax
+from magjax.cli.runtime import prepare_jax
+prepare_jax(many=True)
+print(jax.config.jax_platforms)
+prepare_jax()
+print(jax.config.jax_platforms)
+"""
+
+
+@pytest.mark.parametrize(("asked", "found"), [("", ["None", "cpu"]), ("cuda", ["cuda", "cuda"])], ids=["usual", "asked for"])
+def test_fits_keep_to_the_processor_and_sweeps_do_not(tmp_path, asked, found):
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_PLATFORMS"} | {"MAGJAX_CACHE": str(tmp_path)}
+    environment |= {"JAX_PLATFORMS": asked} if asked else {}
+    done = subprocess.run([sys.executable, "-c", PLATFORMS], env=environment, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert [line or "None" for line in done.stdout.splitlines()] == found
+
+
 @pytest.mark.parametrize(("frequencies", "why"), [
     ("10:300:100000000000", "values along one axis"), ("10:300:0", "give 1 to"), ("10:300:900000", "54,000,000 steady states in one sweep"),
 ])  # fmt: skip
