@@ -12,6 +12,7 @@ import numpy as np
 
 from magjax.effects import CLASSES
 
+from .fit import finest
 from .screen import Candidate
 
 LEADERS = 6  # families of directions that are tried
@@ -30,6 +31,7 @@ OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law im
 DETAIL_SHARE = 0.3  # of the misfit that an effect takes where the details of its law are tried
 AT_NOISE = 0.92  # chi2/N at which a fit with nothing missing ends
 MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
+ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart
 
 
@@ -229,11 +231,20 @@ def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
     if t.result.chi2_per_sample < SETTLED_CHI2 and behind < min(near[0] * best.drop, near[1]):
         foretold = "" if near == WEAK_TIE else ", and with the best the check recordings are still missed about as far as without"
         return f"it meets the noise too (chi2/N below {SETTLED_CHI2:g}), {behind:.0f} in chi2 behind the best{foretold}"
-    if best.result.chi2_per_sample > MISFIT and behind < MISFIT_TIE * chi2_of(best.result):
+    left = best.result.chi2_per_sample
+    if left > MISFIT and left_by_density(best.result):
+        least = TIE * left
+        return f"what is left is a rough density's, and its BIC or AIC comes within {TIE:g} times that of the best's" if behind < least else ""
+    if left > MISFIT and behind < MISFIT_TIE * chi2_of(best.result):
         return f"the best leaves a misfit itself, of which {behind:.0f} in chi2 behind it are less than {MISFIT_TIE:.0%}"
     if behind < 2 * TIE and _same(t, best):
         return f"to first order it does the same to the reading, and its BIC or AIC comes within {2 * TIE:g} of the best's"
     return ""
+
+
+def left_by_density(result) -> bool:
+    """Whether a misfit is most likely what the finest hats do not follow: it acts as further noise, not as an effect that none names."""
+    return finest(result.choices) and result.chi2_per_sample < ROUGH_CHI2
 
 
 def of_one_family(a: Trial, b: Trial) -> bool:

@@ -18,9 +18,10 @@ from .attribute import (
     MIN_DROP,
     MISFIT,
     chi2_of,
+    excess_of,
 )
 from .check import check_errors
-from .fit import REFINE_BELOW, finer_than
+from .fit import FINER_FROM, REFINE_BELOW, hats_of_step
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
@@ -34,6 +35,7 @@ from .search import search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
 from .verdict import (
+    HALF,
     WORSE,
     Z_THRESHOLD,
     Diagnosis,
@@ -52,6 +54,7 @@ COARSE = 0.5  # of a misfit, that a finer density may leave where the first one 
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
+FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -271,19 +274,44 @@ def _better_valley(task, plain, candidates, current):
 
 
 def _screened_finer(task, base, candidates, free):
-    """The base and its candidates; where none would take half of what is left, a finer density is given a chance first."""
-    above = chi2_of(base) - base.data_count
-    best = max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)
-    if base.chi2_per_sample < REFINE_BELOW or base.choices.knots is None or best > 0.5 * above:
+    """The base and its candidates; where none would take half of what is left, a finer density is given a chance first.
+
+    What a density rougher than its hats leaves scores as effects do (up to 20 on nulls), but on the finest hats (up to 4.3): there
+    they are asked for again.
+    """
+    if base.choices.knots is None or _leader_takes(base, candidates) > HALF:
         return base, candidates
+    if base.chi2_per_sample > REFINE_BELOW:
+        finer = _finer(task, base, free)
+        candidates = candidates if finer is base else screened(finer, task.choices)
+        base = finer
+    last = hats_of_step(base.choices, task.bench, 2)
+    rough = last and base.choices.knots != task.choices.knots and base.chi2_per_sample > FINER_FROM[1]
+    if rough and _leader_takes(base, candidates) < HALF:
+        finest = task.fit_on(base, base.actuator, extra=free, choices=last[0])
+        if excess_of(finest, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
+            return finest, screened(finest, task.choices)
+    return base, candidates
+
+
+def _finer(task, base, free):
+    """The fit on a finer density, if one takes its share of what the base leaves."""
     finer = base
-    if base.chi2_per_sample > UNEXPLAINED:  # physics, most likely: unless the next density takes nearly all of it
-        for choices in finer_than(base.choices, task.bench)[0]:
+    if base.chi2_per_sample > UNEXPLAINED:  # physics, most likely: unless finer hats take most of it
+        for choices in (*hats_of_step(base.choices, task.bench, 0), *hats_of_step(base.choices, task.bench, 1)):
             finer = task.fit_on(base, base.actuator, extra=free, choices=choices)
-        if chi2_of(finer) - finer.data_count > COARSE * above:
-            return base, candidates
-    finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=UNEXPLAINED)
-    return (base, candidates) if finer.choices == base.choices else (finer, screened(finer, task.choices))
+            if excess_of(finer, 1.0) < COARSE * excess_of(base, 1.0):
+                break
+        else:
+            return base
+    finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=max(UNEXPLAINED, finer.chi2_per_sample + 1))
+    return base if finer.choices == base.choices else finer
+
+
+def _leader_takes(base, candidates) -> float:
+    """Of what a fit leaves, the most that an effect promises which no density passes for."""
+    best = max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)
+    return best / max(excess_of(base, 1.0), MIN_DROP)
 
 
 def _floors(result) -> dict:

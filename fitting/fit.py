@@ -187,6 +187,12 @@ def _settled(problem, solution) -> bool:
     return _strain(problem, solution) <= CALM * problem.layout.memories and solution.chi2 < REST_SETTLED * problem.data_count
 
 
+def memory_is_told(result) -> bool:
+    """Whether the recordings' levels say that their start memory is the right one: beside any other they are seldom calm."""
+    memories = result.problem.layout.memories
+    return memories > 0 and _strain(result.problem, result.solution) <= CALM * memories
+
+
 def against_memory(fits) -> list[float]:
     """What speaks against the start memory of each fit of the same recordings: pairs of a problem and its solution.
 
@@ -270,6 +276,16 @@ def finer_than(choices, bench) -> tuple:
         return ((),) * len(steps)
     taken = [any(row.knots is not None and row.knots <= choices.knots for row in step) for step in steps]
     return tuple(() if done else step for step, done in zip(steps, taken, strict=True))
+
+
+def hats_of_step(choices, bench, step: int) -> tuple:
+    """The hats of a step of `FINER`; () where these have been taken, and for cells."""
+    return tuple(row for row in finer_than(choices, bench)[step] if row.knots is not None)
+
+
+def finest(choices) -> bool:
+    """Whether no finer hats are tried than those of `choices`."""
+    return choices.knots is not None and choices.knots >= FINER[-1][0]["knots"]
 
 
 def cells_beside(choices) -> tuple:

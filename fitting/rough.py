@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from .attribute import LIKE_DENSITY, MIN_DROP, SETTLED_CHI2, chi2_of, excess_of
-from .fit import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats
+from .fit import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats, finest
 from .screen import screened
 from .search import SECOND_Z, search
 from .setup import Choices
@@ -69,16 +69,17 @@ def is_rough(evidence, checks) -> bool:
 
 def _clear(evidence) -> bool:
     """Whether what was found scored far beyond what a rough density ever leaves, takes most of a misfit that one may leave, and
-    leaves nothing that scores beyond that, or next to what it scored itself."""
+    leaves nothing that scores beyond that, or next to what it scored itself. On the finest hats, where a rough density scores next
+    to nothing, it need not take most."""
     first = evidence.reached.steps[0][0].candidate
-    if (
-        first.name in LIKE_DENSITY
-        or abs(first.z) < CLEAR_Z
-        or evidence.share < HALF
-        or evidence.plain.chi2_per_sample > REFINE_BELOW
-    ):
+    plain, current = evidence.plain, evidence.reached.current
+    told = finest(plain.choices)
+    if first.name in LIKE_DENSITY or abs(first.z) < (SECOND_Z if told else CLEAR_Z) or plain.chi2_per_sample > REFINE_BELOW:
         return False
-    return _highest_beside(evidence.reached.current) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
+    if evidence.share < HALF and not told:
+        return False
+    beside = [c for c in screened(current, current.choices) if not (told and c.name in LIKE_DENSITY)]
+    return max((abs(c.z) for c in beside), default=0.0) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
 
 
 def on_cells_alone(task, evidence) -> Evidence | None:

@@ -35,7 +35,7 @@ from .attribute import (
 )
 from .check import check_errors
 from .exchange import backward, commuted, exchange
-from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, against_memory, rests_of
+from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, against_memory, finer_hats, memory_is_told, rests_of
 from .foretold import Foreteller
 from .rows import SLOW
 from .screen import screened
@@ -301,14 +301,15 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
     found = chosen = task.choices
     free = dataclasses.replace(chosen, rest="auto")
     order = sum(rests_of(task.bench, free), ())
-    if any_rest and len(order) > 1 and (chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED):
+    unsure = chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED
+    if any_rest and len(order) > 1 and unsure and not memory_is_told(best.result):
         other = task.fit_on(best.result, best.result.actuator, choices=free)
         margin = MIN_DROP if order.index(other.choices.rest) < order.index(chosen.rest) else -MIN_DROP
         against = against_memory([(fit.problem, fit.solution) for fit in (other, best.result)])
         if against[0] < against[1] + margin:
             found = other.choices
     highest = max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
-    if any_density and chosen.knots is not None and FINER_FROM[0] < best.result.chi2_per_sample < highest:
+    if any_density and finer_hats(chosen) and FINER_FROM[0] < best.result.chi2_per_sample < highest:
         found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra, refine=highest).choices
     if found == chosen:
         return best, good, task

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, rivals_of
+from .attribute import MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .instruments import exchange
@@ -20,7 +20,6 @@ SILENT_CHI2 = 1.15  # above it something may be missing even where no single nam
 Z_THRESHOLD = 5.5  # about forty columns are looked at
 HALF = 0.5  # of the excess over NULL_CHI2 must be taken where the repair all but meets the noise
 NULL_CHI2 = 0.95
-ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
 FULL_SHARE = 0.96
 CLEAN_CHI2, FULLER_SHARE = 1.5, 0.998  # from here on it must explain so much: right effects on smooth densities leave less
 WELL_FORETOLD = (10.0, 0.05)  # misfit of a check recording from which, and the share of it up to which, FULL_SHARE is enough

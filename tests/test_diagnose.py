@@ -126,7 +126,7 @@ def a_fit(chi2, R_eddy, *effects):
     estimates = (SimpleNamespace(name="coil.R_eddy", value=R_eddy, free=True),)
     effects = tuple(SimpleNamespace(name=n) for n in effects)
     return SimpleNamespace(
-        converged=True, choices=None, chi2_per_sample=chi2, data_count=100, estimates=estimates, actuator=SimpleNamespace(effects=effects), estimate=lambda name: estimates[0]
+        converged=True, choices=Choices(), chi2_per_sample=chi2, data_count=100, estimates=estimates, actuator=SimpleNamespace(effects=effects), estimate=lambda name: estimates[0]
     )  # fmt: skip
 
 
@@ -227,6 +227,57 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
     found = rough_module.on_cells_alone(Task((), bench), evidence)
     assert (found is not None) == rough
     assert not rough or (found.raw is found.plain is found.reached.current is fits[30] and not found.reached.steps)
+
+
+@pytest.mark.parametrize(
+    ("plain", "score", "left", "asked", "taken"),
+    [
+        ((700.0, 0), 30.0, {1: 500.0, 2: 80.0, 3: 19.0}, [1, 2, "refine", 3], 3),  # the first finer hats take less than half
+        ((700.0, 0), 30.0, {1: 100.0, 2: 80.0, 3: 60.0}, [1, "refine", 3], 3),
+        ((700.0, 0), 200.0, {}, [], 0),  # an effect promises more than half
+        ((700.0, 0), 30.0, {1: 600.0, 2: 500.0}, [1, 2], 0),
+        ((30.0, 0), 20.0, {2: 2.0, 3: 1.95}, ["refine", 3], 2),  # and the finest no tenth of the rest
+        ((3.0, 2), 9.0, {3: 2.0}, [3], 3),  # a fit that found its density rough by itself
+        ((3.0, 0), 9.0, {}, [], 0),  # one that did not
+        ((1.4, 2), 3.0, {}, [], 2),
+        ((2.0, 3), 3.0, {}, [], 3),
+    ],
+)
+def test_effects_are_asked_for_on_the_finest_hats_where_a_rough_density_hides_them(monkeypatch, bench, plain, score, left, asked, taken):
+    hats = [(18, 13), (26, 18), (36, 24), (48, 32)]
+
+    def fitted(chi2n, step):
+        fit = a_fit(chi2n, 60.0)
+        fit.choices = Choices(knots=hats[step])
+        return fit
+
+    def fit_on(task, start, *a, choices, refine=False, **more):
+        steps.append("refine" if refine else hats.index(choices.knots))
+        step = max(hats.index(start.choices.knots), 2) if refine else hats.index(choices.knots)
+        return fitted(left[step], step)
+
+    steps, base = [], fitted(*plain)
+    monkeypatch.setattr(Task, "fit_on", fit_on)
+    monkeypatch.setattr(module, "screened", lambda fit, choices: [scored("creep", 5.0)])
+    found, candidates = module._screened_finer(Task((), bench), base, [scored("creep", score), scored("mean_field", 900.0)], ())
+    assert found.choices.knots == hats[taken] and steps == asked
+    assert (found is base) == (candidates[0].z == score)
+
+
+@pytest.mark.parametrize(
+    ("knots", "score", "share", "beside", "clear"),
+    [
+        ((36, 24), 25.0, 0.6, 7.0, True), ((36, 24), 12.0, 0.6, 4.0, False), ((36, 24), 25.0, 0.3, 4.0, False),
+        ((48, 32), 12.0, 0.2, 4.0, True),  # on the finest hats nulls score 4
+        ((48, 32), 7.0, 0.2, 4.0, False), ((48, 32), 12.0, 0.2, 9.0, False),
+    ],
+)  # fmt: skip
+def test_what_is_clear_of_a_rough_density(monkeypatch, knots, score, share, beside, clear):
+    plain, current = a_fit(2.5, 60.0), a_fit(2.5 - 1.5 * share, 60.0, "creep")
+    plain.choices = current.choices = Choices(knots=knots)
+    best = dataclasses.replace(trial("creep", current, 100.0), candidate=scored("creep", score))
+    monkeypatch.setattr(rough_module, "screened", lambda *a: [scored("backlash", beside), scored("mean_field", 7.5)])
+    assert rough_module._clear(evidence_of([(best, [best], [best], plain)], plain, current, (), {})) == clear
 
 
 DROPS = {"second_mode": 1500.0, "mean_field": 1400.0, "transport_delay": 900.0, "backlash": 300.0}
