@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from .attribute import MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of
+from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, rivals_of
 from .check import check_errors
 from .experiments import INSTRUMENTS, instrument_request, next_experiment
 from .instruments import exchange
