@@ -289,22 +289,25 @@ def _screened_finer(task, base, candidates, free):
     rough = last and base.choices.knots != task.choices.knots and base.chi2_per_sample > FINER_FROM[1]
     if rough and _leader_takes(base, candidates) < HALF:
         finest = task.fit_on(base, base.actuator, extra=free, choices=last[0])
-        if excess_of(finest, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
+        if finest.chi2_per_sample < REFINE_BELOW and excess_of(finest, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
             return finest, screened(finest, task.choices)
     return base, candidates
 
 
 def _finer(task, base, free):
     """The fit on a finer density, if one takes its share of what the base leaves."""
-    finer = base
+    finer, late = base, False
     if base.chi2_per_sample > UNEXPLAINED:  # physics, most likely: unless finer hats take most of it
-        for choices in (*hats_of_step(base.choices, task.bench, 0), *hats_of_step(base.choices, task.bench, 1)):
-            finer = task.fit_on(base, base.actuator, extra=free, choices=choices)
+        for late in (False, True):
+            for choices in hats_of_step(base.choices, task.bench, int(late)):
+                finer = task.fit_on(base, base.actuator, extra=free, choices=choices)
             if excess_of(finer, 1.0) < COARSE * excess_of(base, 1.0):
                 break
         else:
             return base
-    finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=max(UNEXPLAINED, finer.chi2_per_sample + 1))
+    finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=UNEXPLAINED)
+    if late and finer.chi2_per_sample > REFINE_BELOW:  # so fine a density bends to physics, too
+        return base
     return base if finer.choices == base.choices else finer
 
 

@@ -232,8 +232,10 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
 @pytest.mark.parametrize(
     ("plain", "score", "left", "asked", "taken"),
     [
-        ((700.0, 0), 30.0, {1: 500.0, 2: 80.0, 3: 19.0}, [1, 2, "refine", 3], 3),  # the first finer hats take less than half
-        ((700.0, 0), 30.0, {1: 100.0, 2: 80.0, 3: 60.0}, [1, "refine", 3], 3),
+        ((700.0, 0), 30.0, {1: 500.0, 2: 7.0, 3: 1.9}, [1, 2, "refine", 3], 3),  # the first finer hats take less than half
+        ((700.0, 0), 30.0, {1: 500.0, 2: 80.0}, [1, 2, "refine"], 0),  # and those after them leave physics
+        ((700.0, 0), 30.0, {1: 100.0, 2: 20.0, 3: 6.0}, [1, "refine", 3], 3),
+        ((700.0, 0), 30.0, {1: 100.0, 2: 80.0, 3: 60.0}, [1, "refine", 3], 2),  # nor do the finest come near
         ((700.0, 0), 200.0, {}, [], 0),  # an effect promises more than half
         ((700.0, 0), 30.0, {1: 600.0, 2: 500.0}, [1, 2], 0),
         ((30.0, 0), 20.0, {2: 2.0, 3: 1.95}, ["refine", 3], 2),  # and the finest no tenth of the rest
