@@ -12,7 +12,7 @@ import numpy as np
 
 from magjax.effects import CLASSES
 
-from .fit import finest
+from .finer import finest
 from .screen import Candidate
 
 LEADERS = 6  # families of directions that are tried

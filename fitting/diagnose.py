@@ -21,7 +21,7 @@ from .attribute import (
     excess_of,
 )
 from .check import check_errors
-from .fit import FINER_FROM, REFINE_BELOW, hats_of_step
+from .finer import FINER_FROM, REFINE_BELOW, hats_of_step
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
@@ -282,7 +282,7 @@ def _screened_finer(task, base, candidates, free):
     if base.choices.knots is None or _leader_takes(base, candidates) > HALF:
         return base, candidates
     if base.chi2_per_sample > REFINE_BELOW:
-        finer = _finer(task, base, free)
+        finer = _on_finer_hats(task, base, free)
         candidates = candidates if finer is base else screened(finer, task.choices)
         base = finer
     last = hats_of_step(base.choices, task.bench, 2)
@@ -294,7 +294,7 @@ def _screened_finer(task, base, candidates, free):
     return base, candidates
 
 
-def _finer(task, base, free):
+def _on_finer_hats(task, base, free):
     """The fit on a finer density, if one takes its share of what the base leaves."""
     finer, late = base, False
     if base.chi2_per_sample > UNEXPLAINED:  # physics, most likely: unless finer hats take most of it

@@ -17,8 +17,8 @@ from magjax.instruments import SENSOR_LAWS, fit_laws, judge_laws, judge_source
 
 from .check import check_errors
 from .fit import fit_or_stop as fit
-from .fit import rests_of
 from .joint import data_residual
+from .memories import rests_of
 from .setup import build_problem, effect_parameters, free_parameters, spectra_of
 from .spectra import line_deviations, reduce_recording, with_noise
 

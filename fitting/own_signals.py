@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 
 from .attribute import BIC_DROP, CLOSE, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
-from .fit import FINER_FROM
+from .finer import FINER_FROM
 from .on_lines import hum_score, offset_score, zeros_score
 from .record_level import hum_is_seen, hum_of, record_effects, remove_record_effect, zeros_of
 from .rows import DRIFTS

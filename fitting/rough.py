@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from .attribute import LIKE_DENSITY, MIN_DROP, ROUGH_CHI2, SETTLED_CHI2, chi2_of, excess_of
-from .fit import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats, finest
+from .finer import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats, finest
 from .screen import screened
 from .search import SECOND_Z, search
 from .setup import Choices
@@ -78,8 +78,7 @@ def _clear(evidence) -> bool:
         return False
     if evidence.share < HALF and not told:
         return False
-    beside = [c for c in screened(current, current.choices) if not (told and c.name in LIKE_DENSITY)]
-    return max((abs(c.z) for c in beside), default=0.0) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
+    return _highest_beside(current, LIKE_DENSITY if told else ()) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
 
 
 def on_cells_alone(task, evidence) -> Evidence | None:
@@ -139,9 +138,9 @@ def beside_cells(task, evidence) -> Evidence | None:
     return dataclasses.replace(evidence, reached=reached, raw=cells, plain=cells, candidates=tuple(candidates))
 
 
-def _highest_beside(result) -> float:
-    """The highest score of any further effect."""
-    return max((abs(c.z) for c in screened(result, result.choices)), default=0.0)
+def _highest_beside(result, but=()) -> float:
+    """The highest score of any further effect; `but`: names that do not count."""
+    return max((abs(c.z) for c in screened(result, result.choices) if c.name not in but), default=0.0)
 
 
 def by_cells(task, evidence) -> Evidence | None:

@@ -35,8 +35,9 @@ from .attribute import (
 )
 from .check import check_errors
 from .exchange import backward, commuted, exchange
-from .fit import FINER_FROM, REFINE_BESIDE, REST_SETTLED, against_memory, finer_hats, memory_is_told, rests_of
+from .finer import FINER_FROM, REFINE_BESIDE, finer_hats
 from .foretold import Foreteller
+from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .rows import SLOW
 from .screen import screened
 from .together import SIDE_BY_SIDE, let_go, together

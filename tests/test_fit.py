@@ -17,8 +17,10 @@ import magjax.bench
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import COLUMNS, DensityBasis, cell_basis, everett_values, hat_basis
-from fitting.fit import FINER, beyond_the_rod, cells_beside, finer_hats, finer_than, fit, guessed, loose, valleys
+from fitting.finer import FINER, cells_beside, finer_hats, finer_than
+from fitting.fit import fit
 from fitting.joint import data_residual
+from fitting.outcome import beyond_the_rod, guessed, loose, valleys
 from fitting.recipe import recipe_beside
 from fitting.setup import Choices, build_problem, free_parameters, spectra_of
 from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum

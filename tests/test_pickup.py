@@ -174,7 +174,7 @@ def test_what_else_stands_out_stays(what):
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_a_file_with_strays_is_mended_where_it_is_read_and_says_so(tmp_path, number):
-    from fitting.fit import strayed
+    from fitting.outcome import strayed
     from magjax.bench import load_bench
     from magjax.inspection import inspect
     from magjax.readers import load_recordings

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import magjax
-from fitting.fit import outcome
 from fitting.floors import swapped
+from fitting.outcome import outcome
 from fitting.setup import spectra_of
 from magjax.bench import load_bench
 from magjax.cli import main

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from fitting.density import hat_basis
-from fitting.fit import _best_memory, fit
+from fitting.fit import fit
+from fitting.memories import best_memory
 from fitting.recipe import lag_recipe
 from fitting.setup import Choices
 from fitting.starts import unreached_row
@@ -171,4 +172,4 @@ def test_the_levels_tell_the_start_memory_where_much_is_amiss(ended, best):
         z = np.append(np.ones(5), np.full(8, np.sqrt(strain)))
         return known, SimpleNamespace(chi2=648 * chi2n, z=z), Choices(rest=name)
 
-    assert _best_memory([row(name, *found) for name, found in ended.items()])[2].rest == best
+    assert best_memory([row(name, *found) for name, found in ended.items()])[2].rest == best

@@ -6,7 +6,7 @@ import types
 import numpy as np
 import pytest
 
-from fitting.fit import RESTS
+from fitting.memories import RESTS
 from fitting.report.misfit import STAGES, against, convergence, misfit_map, row_labels, stages_of
 from fitting.report.misfit import autocorrelation as drawn_autocorrelation
 from fitting.report.residuals import autocorrelation, by_field_and_rate, by_phase, traces
