@@ -302,8 +302,8 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
     found = chosen = task.choices
     free = dataclasses.replace(chosen, rest="auto")
     order = sum(rests_of(task.bench, free), ())
-    unsure = chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED
-    if any_rest and len(order) > 1 and unsure and not memory_is_told(best.result):
+    any_rest = any_rest and len(order) > 1
+    if any_rest and (chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED and not memory_is_told(best.result)):
         other = task.fit_on(best.result, best.result.actuator, choices=free)
         margin = MIN_DROP if order.index(other.choices.rest) < order.index(chosen.rest) else -MIN_DROP
         against = against_memory([(fit.problem, fit.solution) for fit in (other, best.result)])

@@ -204,9 +204,11 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     assert names(kept) == ["sensor_lag", "creep"]  # it may serve beside a later effect
     *_, fixed = module._finer(task, before, best, [best], 1.0, any_rest=False)
     assert fixed.choices.rest == held
-    vars(best.result).update(ended(1.0, 0.4))  # calm levels: no other is asked for
-    assert module._finer(task, before, best, [best], 1.0)[2].choices.rest == held
-    vars(best.result).update(ended(1.0, 0.6))
+    for level, free in ((0.4, False), (0.6, True)):  # calm levels tell the first, where a misfit is left: no other is asked for
+        vars(best.result).update(ended(2.0, level), chi2_per_sample=2.0)
+        *_, first = module._finer(task.on(choices=Choices(rest="negative")), before, best, [best], 1.0, any_density=False)
+        assert first.choices.rest == (found if free else "negative")
+    vars(best.result).update(ended(1.0, 0.6), chi2_per_sample=1.0)
     spoiled.append(True)  # what ends far off from there is not taken
     kept, _, back = module._finer(task, before, best, [best], 1.0)
     assert kept is best and back.choices.rest == held
