@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 CHUNK = 40
 CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
+LOADS = tuple(10.0**-k for k in range(2, 10))  # on a diagonal of ones
 BEND = 0.2  # of the step, over which its curvature is taken
 
 
@@ -133,27 +134,28 @@ class SteppedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         J = options["jacobian"](y)
         information = J.T @ J
         normal, gradient = information + prior, J.T @ residual + prior @ y
-        good = False
+        good, new = False, None
         for _ in range(self.trials):
-            new, predicted = damped_step(normal, gradient, y, damping, self.bounds)
+            new, predicted = damped_step(normal, gradient, y, damping, self.bounds, new)
             trial = fn(new, args)[0]
             new_cost = cost_of(trial, new, prior)
             ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0
+            reached = new
             if ratio < CURVED and float(predicted) > 1e-4 * cost + 1:
                 bent = bent_step(lambda z: fn(z, args)[0], self.bounds, y, new, residual, J, normal, damping)
                 other = fn(bent, args)[0]
                 other_cost = cost_of(other, bent, prior)
                 if not other_cost >= new_cost:
-                    new, trial, new_cost, ratio = bent, other, other_cost, (cost - other_cost) / float(predicted)
+                    reached, trial, new_cost, ratio = bent, other, other_cost, (cost - other_cost) / float(predicted)
             good = bool(np.isfinite(new_cost) and ratio > 1e-3)
             damping = max(damping * (0.15 if ratio > 0.5 else 1.0 if good else 6.0), 1e-9)
             if good or float(predicted) < 1e-6 * cost + 1e-3:
                 break
-        decrement = float(damped_step(normal, gradient, y, 1e-9, self.bounds)[1])
+        decrement = float(damped_step(normal, gradient, y, 1e-9, self.bounds, new)[1])
         if not good:
             return y, SteppedState(damping, cost, residual, information, gradient, decrement, 0.0, False), None
-        left = J.T @ trial + prior @ new
-        return new, SteppedState(damping, new_cost, trial, information, left, decrement, cost - new_cost, True), None
+        left = J.T @ trial + prior @ reached
+        return reached, SteppedState(damping, new_cost, trial, information, left, decrement, cost - new_cost, True), None
 
     def terminate(self, fn, y, args, options, state, tags):
         return state.decrement < self.atol + self.rtol * state.cost, optx.RESULTS.successful
@@ -181,11 +183,12 @@ def bent_step(residual_at, bounds, y, new, residual, J, normal, damping):
     return np.clip(bent, lower, upper)
 
 
-def damped_step(normal, gradient, y, damping, bounds):
-    """The bounded step under a damping relative to the diagonal: (new point, predicted fall of half chi2). In NumPy: nothing to compile."""
+def damped_step(normal, gradient, y, damping, bounds, near=None):
+    """The bounded step under a damping relative to the diagonal: (new point, predicted fall of half chi2). In NumPy: nothing to compile.
+    `near`: that under another damping."""
     scale = np.diagonal(normal)
     scale = scale + 1e-12 * np.max(scale)
-    new = bounded_minimum(normal + np.diag(damping * scale), gradient, y, bounds)
+    new = bounded_minimum(normal + np.diag(damping * scale), gradient, y, bounds, near)
     delta = new - y
     return new, -(gradient @ delta + 0.5 * delta @ normal @ delta)
 
@@ -248,17 +251,25 @@ def normal_equations(fn, y, residual):
     return J.T @ J, J.T @ residual
 
 
-def bounded_minimum(A, gradient, y, bounds, rounds: int = 25) -> np.ndarray:
+def bounded_minimum(A, gradient, y, bounds, near=None) -> np.ndarray:
     """The point between `bounds` where gradient'd + d'A d/2 is least, d counted from y; what ends at a bound is there exactly.
+    `near`: a point that is expected to end at most of the same bounds.
 
-    Block principal pivoting on the free set, quick but without a promise; where it has not ended after `rounds`
-    (a nearly singular A) a feasible active set, which falls at every step, goes on to the optimum.
+    Block principal pivoting on the free set, quick but without a promise; where it has not ended (a nearly singular A), anew under
+    a load on the diagonal that is let go by decades, each from the bounds of the one before; and where that has not either, a
+    feasible active set, which falls at every step.
     """
     scale = 1 / np.sqrt(np.maximum(np.diagonal(A), 1e-300))
     A = A * scale[:, None] * scale[None, :]
     g = gradient * scale
-    walls = tuple((bound - y) / scale for bound in bounds)
-    d, ended = _pivoted(A, g, walls, rounds)
+    walls = tuple(np.clip((bound - y) / scale, -1e300, 1e300) for bound in bounds)
+    near = y if near is None else near
+    side = first = (near >= bounds[1]) * 1 - (near <= bounds[0]) * 1
+    d, side, ended = _pivoted(A, g, walls, side)
+    if not ended:
+        side = first
+        for load in (*LOADS, 0.0):
+            d, side, ended = _pivoted(A + load * np.eye(len(A)), g, walls, side)
     if not ended:
         d = _descended(A, g, walls, d)
     return np.where(d <= walls[0], bounds[0], np.where(d >= walls[1], bounds[1], np.clip(y + d * scale, *bounds)))
@@ -279,11 +290,10 @@ def _minimum(A, g, fixed, at):
     return found
 
 
-def _pivoted(A, g, walls, rounds):
-    """Block principal pivoting between the walls, (lowest, highest) step: (step, whether it is the optimum)."""
-    floor, ceiling = (np.clip(wall, -1e300, 1e300) for wall in walls)
-    # -1 at the floor, 1 at the ceiling, 0 free
-    side = ((ceiling <= 0) & (g < 0)) * 1 - ((floor >= 0) & (g > 0)) * 1
+def _pivoted(A, g, walls, side, rounds: int = 10):
+    """Block principal pivoting between the walls, (lowest, highest) step, from which unknowns are at which (-1, 1; 0 free):
+    (step, the same of it, whether it is the optimum)."""
+    floor, ceiling = walls
     best, count, number = len(g) + 1, 0, 0
     for _ in range(rounds):
         d = _minimum(A, g, side != 0, np.where(side < 0, floor, ceiling))
@@ -295,11 +305,12 @@ def _pivoted(A, g, walls, rounds):
             break
         if number >= best and count >= 3:
             # Murty's single exchange once the block exchange stops making progress
+            side = side.copy()
             side[bad[-1]] = proper[bad[-1]]
         else:
             side = proper
         best, count = min(best, number), 0 if number < best else count + 1
-    return np.clip(d, floor, ceiling), not number
+    return np.clip(d, floor, ceiling), side, not number
 
 
 def _descended(A, g, walls, d, most: int = 400):
