@@ -14,11 +14,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from magjax.errors import MagjaxError
-from magjax.programs import kept
 from magjax.terms import DRIVE_UNITS
 
-from .model import Predictor, whitened
-from .solver import jacobian
+from .joint import data_jacobian, data_residual
+from .model import Predictor
 from .spectra import line_deviations
 from .together import let_go, together
 from .uncertainty import covariance
@@ -130,23 +129,26 @@ def separations(trials, drives, spectra):
     return np.array(columns).T
 
 
-@kept
-def _lines_and_slopes(layout, z, target, template, predictor):
-    def lines(y):
-        return whitened(predictor(layout.actuator(template, y)), target)
-
-    return lines(z), jacobian(lines, z)
-
-
 def _predicted(result, drives, spectra):
-    """Whitened harmonics of the drives, (drives, numbers), their Jacobian, (drives, numbers, unknowns), and the fit's covariance."""
-    problem, solution = result.problem, result.refined
-    wanted = [_asked(spectra[0], *drive) for drive in drives]
-    coarse = problem.predictors[0]
-    predictor = Predictor.build(
-        wanted, min(d.shape[1] for d in coarse.drives), coarse.harmonics, coarse.periods, max(coarse.corners, 4)
-    )
-    deviations = np.stack([line_deviations(s, s.noise)[: coarse.harmonics + 1] for s in wanted])
+    """Whitened harmonics of the drives, (drives, numbers), their Jacobian, (drives, numbers, unknowns), and the fit's covariance.
+
+    By the programs of the fits, and as many drives at once as there were recordings.
+    """
+    problem, solution, coarse = result.problem, result.refined, result.problem.predictors[0]
+    wanted, memories = [_asked(spectra[0], *drive) for drive in drives], problem.layout.memories
+    z, most = np.array(solution.z), memories or len(wanted)
+    shared = len(z) - memories
+    z[shared:] = 0.0
+    rows = [_rows_of(problem, z, wanted[at : at + most], coarse) for at in range(0, len(wanted), most)]
+    r, J = (np.concatenate(part) for part in zip(*rows, strict=True))
+    return r, J[..., :shared], covariance(solution.normal, solution.z, problem.layout)[:shared, :shared]
+
+
+def _rows_of(problem, z, spectra, coarse):
+    """Of some drives: whitened harmonics, (drives, numbers), and their Jacobian."""
+    samples = min(d.shape[1] for d in coarse.drives)
+    predictor = Predictor.build(spectra, samples, coarse.harmonics, coarse.periods, max(coarse.corners, 4))
+    deviations = np.stack([line_deviations(s, s.noise)[: coarse.harmonics + 1] for s in spectra])
     deviations[:, 0] = np.where(np.isinf(np.asarray(problem.target.deviations)[0, 0]), np.inf, deviations[:, 0])
     m, count = deviations.shape
     zero = jnp.zeros((m, count), complex)
@@ -155,9 +157,9 @@ def _predicted(result, drives, spectra):
         problem.target,
         (zero, jnp.asarray(deviations), zero, jnp.zeros((m, m))),
     )
-    r, J = (np.asarray(x) for x in _lines_and_slopes(problem.layout, jnp.asarray(solution.z), target, problem.template, predictor))
+    asked = dataclasses.replace(problem, predictors=(predictor, predictor), target=target, spectra=tuple(spectra))
     at = [np.concatenate([k * count + np.arange(count), m * count + k * (count - 1) + np.arange(count - 1)]) for k in range(m)]
-    return r[np.array(at)], J[np.array(at)], covariance(solution.normal, solution.z, problem.layout)
+    return data_residual(asked, z)[np.array(at)], data_jacobian(asked, z)[np.array(at)]
 
 
 def _asked(spectrum, f, A, offset):

@@ -1,6 +1,7 @@
 """fit(recordings, bench): the joint fit as users call it, its start memories and its density."""
 
 import dataclasses
+import functools
 import time
 
 import equinox as eqx
@@ -26,7 +27,7 @@ from .outcome import (
     unsettled,
     valleys,
 )
-from .result import FitResult
+from .result import FitResult, Quoted
 from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of, with_held_masses
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
@@ -97,8 +98,6 @@ def fit_or_stop(*arguments, **options) -> FitResult:
     if result.solution.interrupted:
         raise KeyboardInterrupt
     return result
-
-
 
 
 def _changes_scale(bench, names, start) -> bool:
@@ -212,19 +211,31 @@ _actuator_at = eqx.filter_jit(lambda layout, template, z: layout.actuator(templa
 
 
 def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.inf) -> FitResult:
-    """Estimates (quoted with a tenth of the roughness weights, but of a fit that missed its `target`), per-recording misfit, outcome."""
+    """Per-recording misfit and the outcome; what is quoted, of a fit that missed its `target` too, waits until it is asked for."""
     fitted = _actuator_at(problem.layout, problem.template, jnp.asarray(solution.z))
     count = problem.data_count
-    refined = solution
-    if solution.chi2 / count < 20 and not solution.chi2 > target:
-        refined = solve(problem, solution.z, UNDERSMOOTH * solution.weights, max_jacobians=4, evidence=False)
-    quoted = _actuator_at(problem.layout, problem.template, jnp.asarray(refined.z))
-    rows = estimates(problem, refined, quoted)
     residual = data_residual(problem, solution.z)
     per_recording = recording_fits(problem, residual, recordings, bench)
     cov = covariance(solution.normal, solution.z, problem.layout)
     effective = float(np.trace(cov @ (solution.normal - prior_matrix(problem, solution.weights))))
     chi2n = solution.chi2 / count
+    quote = functools.partial(_quoted, problem, solution, choices, bench, recordings, fitted, per_recording, target)
+    at_bound = chi2n > AT_BOUND and any(e.at_bound and not e.name.startswith("effects.") for e in quote().estimates)
+    lost = not chi2n < LOST or at_bound
+    return FitResult(
+        fitted, bench, bool(solution.converged) and not lost, per_recording, float(chi2n), count, effective,
+        float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, quote,
+        problem.spectra, choices,
+    )  # fmt: skip
+
+
+def _quoted(problem, solution, choices, bench, recordings, fitted, per_recording, target) -> Quoted:
+    """The parameters with a tenth of the roughness weights (but of a fit that missed its `target`), and the outcome in words."""
+    chi2n = solution.chi2 / problem.data_count
+    refined = solution
+    if chi2n < 20 and not solution.chi2 > target:
+        refined = solve(problem, solution.z, UNDERSMOOTH * solution.weights, max_jacobians=4, evidence=False)
+    rows = estimates(problem, refined, _actuator_at(problem.layout, problem.template, jnp.asarray(refined.z)))
     related = correlations(problem, refined)
     message = (
         outcome(chi2n, per_recording, solution, rows, problem, choices.max_jacobians)
@@ -236,9 +247,4 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.in
         + beyond_the_rod(problem.spectra, fitted, bench)
         + contradicted(bench, choices)
     )
-    lost = not chi2n < LOST or (chi2n > AT_BOUND and any(e.at_bound and not e.name.startswith("effects.") for e in rows))
-    return FitResult(
-        fitted, bench, bool(solution.converged) and not lost, message, tuple(rows), related, per_recording, float(chi2n), count,
-        effective, float(solution.chi2 + effective * np.log(count)), solution.jacobians, warm, solution.seconds, problem, solution, refined,
-        problem.spectra, choices,
-    )  # fmt: skip
+    return Quoted(refined, tuple(rows), related, message)

@@ -50,7 +50,7 @@ def final_model(found):
 def _timeless(result):
     """The fit without what differs between two runs of one command, and without what a search does not read."""
     solution = dataclasses.replace(result.solution, seconds=0.0)
-    nothing = {"refined": None, "history": (), "compile_s": 0.0, "solve_s": 0.0}
+    nothing = {"quote": None, "history": (), "compile_s": 0.0, "solve_s": 0.0}
     return dataclasses.replace(result, problem=lean(result.problem), solution=solution, **nothing)
 
 

@@ -1,7 +1,9 @@
 """The result of a fit: a value that prints itself as a card and writes itself as JSON."""
 
 import dataclasses
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +27,25 @@ class RecordingFit:
 
 
 @dataclasses.dataclass(frozen=True)
+class Quoted:
+    """What a fit says of its parameters, and the solution that they are `refined` from."""
+
+    refined: object
+    estimates: tuple
+    correlations: dict
+    message: str
+
+
+@dataclasses.dataclass(frozen=True)
 class FitResult:
-    """A fitted actuator with what is known about it. `chi2_per_sample`: misfit per harmonic over its noise."""
+    """A fitted actuator with what is known about it. `chi2_per_sample`: misfit per harmonic over its noise.
+
+    `quote` makes the `Quoted`: most fits of a diagnosis are never asked for theirs, which take Jacobians of their own.
+    """
 
     actuator: object
     bench: object
     converged: bool
-    message: str
-    estimates: tuple
-    correlations: dict
     recordings: tuple[RecordingFit, ...]
     chi2_per_sample: float
     data_count: int
@@ -44,10 +56,35 @@ class FitResult:
     solve_s: float
     problem: object = dataclasses.field(repr=False, default=None)
     solution: object = dataclasses.field(repr=False, default=None)
-    refined: object = dataclasses.field(repr=False, default=None)
+    quote: Callable[[], Quoted] = dataclasses.field(repr=False, default=None)
     spectra: tuple = dataclasses.field(repr=False, default=())
     choices: object = dataclasses.field(repr=False, default=None)
     history: tuple = dataclasses.field(repr=False, default=())  # (stage, Jacobian, chi2/N) of every step taken
+
+    @functools.cached_property
+    def quoted(self) -> Quoted:
+        """What it says of its parameters; made when it is first asked for."""
+        return self.quote()
+
+    @property
+    def refined(self):
+        """The solution that the parameters are quoted from."""
+        return self.quoted.refined
+
+    @property
+    def estimates(self) -> tuple:
+        """Every parameter with its error."""
+        return self.quoted.estimates
+
+    @property
+    def correlations(self) -> dict:
+        """Correlation of each pair of free physical parameters: "a~b" -> coefficient."""
+        return self.quoted.correlations
+
+    @property
+    def message(self) -> str:
+        """The outcome in words."""
+        return self.quoted.message
 
     def estimate(self, name: str):
         """The estimate of one parameter by name."""

@@ -119,7 +119,8 @@ class Evidence:
     `reached`: what the search has (`search.Reached`); `adopted`: record-level effects, each with its rivals; `raw`: the plain
     fit of the readings as they came, `plain`: that of the readings without record-level signals (the same where there are
     none); `candidates`: the scores beside `plain`; `checks`: the check recordings as they came, and without those signals;
-    `floors`, `where`, `absorbed`: as in `Diagnosis`; `only`: the effects that alone are asked for, where these are named.
+    `floors`, `where`, `absorbed`: as in `Diagnosis`; `only`: the effects that alone are asked for, where these are named;
+    `experiments`: those that were asked for, by rivals.
     """
 
     reached: object
@@ -134,6 +135,14 @@ class Evidence:
     where: dict
     absorbed: tuple
     only: tuple = ()
+    experiments: dict = dataclasses.field(default_factory=dict)
+
+    def next_experiment(self, rivals, also):
+        """As `next_experiment`, of the same rivals once: a verdict is read anew beside other densities."""
+        key = (also, *(id(t.result) for t in rivals))
+        if key not in self.experiments:
+            self.experiments[key] = rivals, next_experiment(rivals, self.raw.spectra, self.bench, also)
+        return self.experiments[key][1]
 
     @property
     def excess(self) -> float:
@@ -321,7 +330,7 @@ def _grouped(evidence, common, effects, groups, rivals, swap, asked) -> Diagnosi
     between = bool(blocks & set(INSTRUMENTS)) and not blocks <= set(INSTRUMENTS)
     # where the noise is not met beside one instrument, the other is in question too
     also = INSTRUMENTS if between and evidence.excess > MISFIT and evidence.command_only else ()
-    experiment = asked or (next_experiment(rivals, evidence.raw.spectra, evidence.bench, also) if rivals else None)
+    experiment = asked or (evidence.next_experiment(rivals, also) if rivals else None)
     names = "; ".join(" or ".join(g) for g in groups)
     number = {2: "two", 3: "three", 4: "four"}.get(len(groups[0]), "several")
     each = (

@@ -14,9 +14,11 @@ import scipy.optimize
 from scipy.sparse import csc_array
 
 import magjax.bench
+from fitting import solver
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import COLUMNS, DensityBasis, cell_basis, everett_values, hat_basis
+from fitting.experiments import _predicted
 from fitting.finer import FINER, cells_beside, finer_hats, finer_than
 from fitting.fit import fit
 from fitting.joint import data_residual
@@ -30,6 +32,7 @@ from magjax.bench import load_bench
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.preisach import Preisach, density_masses
 from magjax.recording import Recording
+from magjax.simulate import simulate
 from tests.studies.joint_fit import NAMES, SINES, TRUTH, one_draw, settled
 
 TRUE = {"coil.R_eddy": 62.0, "mechanics.xi": 0.81, "mechanics.f0": 405.0}
@@ -206,11 +209,31 @@ def test_the_papers_recipe_beside_a_fit(recordings, result):
 
 
 def test_a_fit_that_misses_its_target_is_not_quoted_anew(recordings, bench, result):
-    """A trial of no use costs no further Jacobians; one that comes near is quoted with a tenth of the weights as ever."""
+    """A trial of no use costs no further Jacobians; one that comes near is quoted with a tenth of the weights, once it is asked for it."""
     same = {"choices": result.choices, "refine": False, "start": result, "spectra": result.spectra}
     missed, met = (fit(recordings, bench, actuator=result.actuator, target=t, **same) for t in (1.0, 1e9))
+    assert met.converged and met.recordings and "quoted" not in vars(met)
     assert missed.refined is missed.solution and met.refined is not met.solution
     assert np.allclose(met.refined.weights, 0.1 * met.solution.weights)
+
+
+def test_drives_that_are_asked_for_are_predicted_by_the_programs_of_the_fit(result):
+    """More of them than recordings, which have levels of M of their own; what they do to the reading is a simulation of the drive."""
+    drives = [(f, 0.35, 0.1) for f in (5.0, 20.0, 60.0, 120.0, 240.0)]
+    r, J, known = _predicted(result, drives, result.spectra)
+    layout, z, template = result.problem.layout, result.refined.z, result.problem.template
+    shared, count, samples = layout.size - layout.memories, 41, result.problem.predictors[0].drives[0].shape[1]
+    assert r.shape == (5, 2 * count - 1) and J.shape == (*r.shape, shared) and known.shape == (shared, shared)
+    f, A, offset = drives[3]
+    drive = offset + A * np.sin(2 * np.pi * np.arange(samples) / samples)
+    made = simulate(layout.actuator(template, z), drive, 1 / (f * samples), periodic=True)
+    first = np.fft.rfft(np.asarray(made.reading))[1] / samples
+    assert first.real / r[3, 1] == pytest.approx(first.imag / r[3, count], rel=1e-6)  # both over one deviation
+    k, moved = layout.index("mechanics.f0"), z.copy()
+    moved[k] += 1e-4
+    other = dataclasses.replace(result.quoted, refined=dataclasses.replace(result.refined, z=moved))
+    ahead = _predicted(dataclasses.replace(result, quote=lambda: other), drives, result.spectra)[0]
+    assert (ahead - r) / 1e-4 == pytest.approx(J[..., k], abs=1e-3 * np.abs(J[..., k]).max())
 
 
 def test_a_given_history_is_where_every_recording_starts(recordings, bench):
@@ -291,9 +314,13 @@ def test_bounded_minimum_meets_the_optimality_conditions():
         assert slope[low].min(initial=0) > -1e-7 and slope[high].max(initial=0) < 1e-7
 
 
-def test_bounded_minimum_reaches_the_optimum_where_the_normal_matrix_is_nearly_singular():
-    """Smooth columns, a tenth of them told apart: pivoting in blocks alone ends above its start, a fall that is none."""
+@pytest.mark.parametrize("alone", [False, True])
+def test_bounded_minimum_reaches_the_optimum_where_the_normal_matrix_is_nearly_singular(monkeypatch, alone):
+    """Smooth columns, a tenth of them told apart: pivoting in blocks alone ends above its start, a fall that is none. By loads on the
+    diagonal that are let go, and `alone` by the active set that falls at every step."""
     rng = np.random.default_rng(0)
+    if alone:
+        monkeypatch.setattr(solver, "LOADS", ())
     where = np.linspace(0, 1, 120)
     for width in (0.05, 0.1, 0.2):
         columns = np.exp(-(((np.linspace(0, 1, 200)[:, None] - where) / width) ** 2))
@@ -308,6 +335,29 @@ def test_bounded_minimum_reaches_the_optimum_where_the_normal_matrix_is_nearly_s
             assert (y + d).min() > -1e-10 and np.all(y + d < upper + 1e-10) and g @ d + 0.5 * d @ A @ d < 0
             assert np.abs(slope[~low & ~high]).max() < 1e-7 and high.any() == np.isfinite(upper[0])
             assert slope[low].min(initial=0) > -1e-7 and slope[high].max(initial=0) < 1e-7
+            again = bounded_minimum(A, g, y, (np.zeros(120), upper), y + d) - y
+            assert g @ again + 0.5 * again @ A @ again == pytest.approx(g @ d + 0.5 * d @ A @ d, rel=1e-9)
+
+
+def test_a_nearly_singular_normal_matrix_takes_few_solutions(monkeypatch):
+    """Smooth columns under a roughness prior, from far off: blocks alone do not end, loads that are let go by decades do, and
+    from near the optimum it takes next to none."""
+    rng, solved = np.random.default_rng(1), []
+    where = np.linspace(0, 1, 120)
+    columns = 1e3 * np.exp(-(((np.linspace(0, 1, 200)[:, None] - where) / 0.2) ** 2))
+    D = np.diff(np.eye(120), 2, axis=0)
+    A = columns.T @ columns + 1e-6 * D.T @ D + 1e-9 * np.diag(np.sum(columns**2, axis=0))
+    y = np.maximum(rng.standard_normal(120), 0)
+    g, bounds = A @ y - columns.T @ (1e3 * (rng.standard_normal(200) + 3)), (np.zeros(120), np.full(120, np.inf))
+    minimum = solver._minimum
+    monkeypatch.setattr(solver, "_minimum", lambda *a: solved.append(1) or minimum(*a))
+    found = bounded_minimum(A, g, y, bounds)
+    first = len(solved)
+    bounded_minimum(A, g, y, bounds, found)
+    loaded, solved[:] = (first, len(solved) - first), []
+    monkeypatch.setattr(solver, "LOADS", ())
+    bounded_minimum(A, g, y, bounds)
+    assert loaded[1] < 5 and loaded[0] < 0.7 * len(solved)
 
 
 def test_solver_runs_behind_optimistix():

@@ -8,7 +8,7 @@ import dataclasses
 import sys
 
 from fitting.diagnose import Diagnosis
-from fitting.result import FitResult, RecordingFit, model_as_dict
+from fitting.result import FitResult, Quoted, RecordingFit, model_as_dict
 from fitting.screen import Candidate
 from fitting.uncertainty import Estimate
 from magjax.bench import load_bench
@@ -48,9 +48,8 @@ def specimens() -> dict:
     bench = load_bench("aa-050h")
     actuator = bench.actuator()
     estimate, row = specimen(Estimate, name="coil.R_eddy", unit="ohm"), specimen(RecordingFit, unit="m")
-    fitted = specimen(
-        FitResult, actuator=actuator, bench=bench, estimates=(estimate,), recordings=(row,), correlations={"coil.R_eddy~mechanics.xi": 0.0},
-    )  # fmt: skip
+    quoted = specimen(Quoted, estimates=(estimate,), correlations={"coil.R_eddy~mechanics.xi": 0.0})
+    fitted = specimen(FitResult, actuator=actuator, bench=bench, recordings=(row,), quote=lambda: quoted)
     written = {"reproduce": "", "versions": ""}
     found = specimen(Diagnosis, candidates=(specimen(Candidate, name="creep"),), base=fitted, repaired=fitted, check_left_out=("",))
     return {
