@@ -21,6 +21,7 @@ from .attribute import (
     excess_of,
 )
 from .check import check_errors
+from .diagnosis import Diagnosis, Evidence, misfit
 from .finer import FINER_FROM, REFINE_BELOW, hats_of_step
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
@@ -34,18 +35,7 @@ from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
 from .task import Task
-from .verdict import (
-    HALF,
-    WORSE,
-    Z_THRESHOLD,
-    Diagnosis,
-    Evidence,
-    first_alone,
-    misfit,
-    unexplained,
-    verdict,
-    without_worse,
-)
+from .verdict import HALF, WORSE, Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
 
 ABSORBED_VISIBILITY = 0.004
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led

@@ -25,10 +25,11 @@ from .attribute import (
     to_the_end,
 )
 from .check import check_errors
+from .diagnosis import misfit
 from .instruments import RINGING, mode_as_filter
 from .screen import screened
 from .together import SIDE_BY_SIDE, together
-from .verdict import HALF, NULL_CHI2, misfit
+from .verdict import HALF, NULL_CHI2
 
 NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within which rivals are tried beside later ones; how many
 NEAR_SHARE = 0.25  # of an early effect's fall, within which too

@@ -9,13 +9,14 @@ import dataclasses
 import numpy as np
 
 from .attribute import BIC_DROP, CLOSE, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
+from .diagnosis import SILENT_CHI2, Diagnosis, least_excess
 from .finer import FINER_FROM
 from .on_lines import hum_score, offset_score, zeros_score
 from .record_level import hum_is_seen, hum_of, record_effects, remove_record_effect, zeros_of
 from .rows import DRIFTS
 from .screen import screened
 from .setup import spectra_of
-from .verdict import SILENT_CHI2, Z_THRESHOLD, Diagnosis, least_excess
+from .verdict import Z_THRESHOLD
 
 RECORD_Z = 8.0
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do

@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 
 from .attribute import LIKE_DENSITY, MIN_DROP, ROUGH_CHI2, SETTLED_CHI2, chi2_of, excess_of
+from .diagnosis import Evidence, misfit
 from .finer import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats, finest
 from .screen import screened
 from .search import SECOND_Z, search
 from .setup import Choices
 from .task import freed_beyond
 from .together import together
-from .verdict import FULL_SHARE, HALF, NULL_CHI2, Z_THRESHOLD, Evidence, misfit, too_little
+from .verdict import FULL_SHARE, HALF, NULL_CHI2, Z_THRESHOLD, too_little
 
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CLEAR_Z = 20.0  # the score of an effect that no density imitates: on nulls at chi2/N of 3 the highest are 6 to 7

@@ -34,6 +34,7 @@ from .attribute import (
     try_effect,
 )
 from .check import check_errors
+from .diagnosis import SILENT_CHI2
 from .exchange import backward, commuted, exchange
 from .finer import FINER_FROM, REFINE_BESIDE, finer_hats
 from .foretold import Foreteller
@@ -41,7 +42,7 @@ from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .rows import SLOW
 from .screen import screened
 from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, HALF, SILENT_CHI2, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects

@@ -11,6 +11,7 @@ import fitting.exchange
 import fitting.search
 import fitting.verdict
 from fitting.attribute import Trial, _physical, chi2_of, confidence, family, leaders, rivals_of, tie_of
+from fitting.diagnosis import Evidence
 from fitting.record_level import RecordEffect
 from fitting.rows import behind, creeps_on, sizes_of, ties_of
 from fitting.screen import Candidate
@@ -18,7 +19,7 @@ from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
 from fitting.uncertainty import Estimate
-from fitting.verdict import Evidence, _grouped, dominant, first_alone, too_little, unconfirmed  # fmt: skip
+from fitting.verdict import _grouped, dominant, first_alone, too_little, unconfirmed  # fmt: skip
 from magjax.effects import CLASSES
 
 COUNT = 700

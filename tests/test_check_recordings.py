@@ -11,11 +11,11 @@ import fitting.diagnose as module
 from fitting.check import beyond_plane, check_errors, predictions
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
+from fitting.diagnosis import Diagnosis
 from fitting.reach import beyond_text
 from fitting.report.tables import checks
 from fitting.setup import Choices
 from fitting.task import Task
-from fitting.verdict import Diagnosis
 from magjax.bench import load_bench
 from magjax.effects import AmplifierClipping
 from magjax.errors import ConfigurationError

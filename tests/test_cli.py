@@ -11,8 +11,8 @@ import fitting.diagnose
 import fitting.fit
 import fitting.paper
 from fitting.demo import concealed_actuator, record
+from fitting.diagnosis import Diagnosis
 from fitting.fit import fit
-from fitting.verdict import Diagnosis
 from magjax.bench import load_bench
 from magjax.cli import COMMANDS, main
 from magjax.model_file import load_model

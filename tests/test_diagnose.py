@@ -15,6 +15,7 @@ from fitting.attribute import Trial, chi2_of, rivals_of
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
+from fitting.diagnosis import Diagnosis, Evidence
 from fitting.floors import data_problem
 from fitting.learned import Learned
 from fitting.nonparametric import Place
@@ -25,7 +26,6 @@ from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
 from fitting.spectra import line_deviations
 from fitting.task import Task
-from fitting.verdict import Diagnosis, Evidence
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import fitting.diagnose
+from fitting.diagnosis import Diagnosis
 from fitting.floors import data_problem
 from fitting.record_level import record_effects, remove_from_checks, remove_record_effect
 from fitting.setup import spectra_of
-from fitting.verdict import Diagnosis
 from magjax.bench import load_bench
 from magjax.recording import Recording
 

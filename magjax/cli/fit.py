@@ -194,8 +194,8 @@ def run_diagnose(arguments) -> int:
     if bench.output == "strain":
         return _diagnose_strain(options, bench, folder)
     from fitting.diagnose import diagnose
+    from fitting.diagnosis import unusable
     from fitting.setup import Choices
-    from fitting.verdict import unusable
 
     recordings, checks, stopped, shown = [], [], None, None
     try:

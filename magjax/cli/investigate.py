@@ -54,8 +54,8 @@ def analysis(bench, folder, options, live):
         live.tell("reading and compiling")
         prepare_jax()
         from fitting.diagnose import diagnose
+        from fitting.diagnosis import unusable
         from fitting.report import write_diagnosis
-        from fitting.verdict import unusable
         from magjax.errors import RecordingError
         from magjax.readers import load_checks, load_sound
 

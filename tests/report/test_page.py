@@ -411,7 +411,7 @@ def test_a_misfit_that_is_no_number_is_never_a_verdict(folders, tmp_path):
 
 
 def test_a_file_that_cannot_be_used_is_shown_and_the_others_are_told(tmp_path, runs, bench):
-    from fitting.verdict import unusable
+    from fitting.diagnosis import unusable
 
     paths = [tmp_path / f"rec_{k}.csv" for k in range(3)]
     for k, (path, run) in enumerate(zip(paths, runs[0], strict=True)):
