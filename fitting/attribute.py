@@ -12,7 +12,7 @@ import numpy as np
 
 from magjax.effects import CLASSES
 
-from .finer import finest
+from .finer import REFINE_BELOW, finest
 from .screen import Candidate
 
 LEADERS = 6  # families of directions that are tried
@@ -244,7 +244,7 @@ def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
 
 def left_by_density(result) -> bool:
     """Whether a misfit is most likely what the finest hats do not follow: it acts as further noise, not as an effect that none names."""
-    return finest(result.choices) and result.chi2_per_sample < ROUGH_CHI2
+    return finest(result.choices) and result.chi2_per_sample < REFINE_BELOW
 
 
 def of_one_family(a: Trial, b: Trial) -> bool:

@@ -22,7 +22,7 @@ from .attribute import (
 )
 from .check import check_errors
 from .diagnosis import Diagnosis, Evidence, misfit
-from .finer import FINER_FROM, REFINE_BELOW, hats_of_step
+from .finer import FINER_FROM, REFINE_BELOW, finer_hats, finest, hats_of_step
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
@@ -30,7 +30,7 @@ from .locate import where
 from .own_signals import hum_on_harmonics, needless_zeros, own_zeros, record_level, sensor_zero, unsettled_means, with_zero
 from .reach import BEYOND
 from .record_level import remove_from_checks
-from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance
+from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance, worth_a_search
 from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
@@ -44,6 +44,7 @@ COARSE = 0.5  # of a misfit, that a finer density may leave where the first one 
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
+ALL_BUT, FINEST_BELOW = 0.05, 30.0  # share of a misfit that the finest hats may leave, and chi2/N, to be gone on with above REFINE_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
@@ -186,7 +187,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
             anew.append({"task": cleaned, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
         return bool(anew)
 
-    reached = search(task, plain, candidates, checks[1], begins_anew, free_means)
+    reached = search(task, plain, worth_a_search(plain, candidates), checks[1], begins_anew, free_means)
     if anew:
         return _examined(measured=measured, check=check, zeros=zeros, **anew[-1])
     if before_zeros and needless_zeros(before_zeros[0], reached):
@@ -276,7 +277,7 @@ def _screened_finer(task, base, candidates, free):
         candidates = candidates if finer is base else screened(finer, task.choices)
         base = finer
     last = hats_of_step(base.choices, task.bench, 2)
-    rough = last and base.choices.knots != task.choices.knots and base.chi2_per_sample > FINER_FROM[1]
+    rough = last and base.choices.knots != task.choices.knots and FINER_FROM[1] < base.chi2_per_sample < UNEXPLAINED
     if rough and _leader_takes(base, candidates) < HALF:
         finest = task.fit_on(base, base.actuator, extra=free, choices=last[0])
         if finest.chi2_per_sample < REFINE_BELOW and excess_of(finest, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
@@ -296,9 +297,23 @@ def _on_finer_hats(task, base, free):
         else:
             return base
     finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=UNEXPLAINED)
+    rough = _on_last_hats(task, finer, free) if finer.chi2_per_sample > UNEXPLAINED else finer
+    if finest(rough.choices) and REFINE_BELOW < rough.chi2_per_sample < FINEST_BELOW:
+        finer = rough if excess_of(rough, 1.0) < ALL_BUT * excess_of(base, 1.0) else finer
+        late = late and finer is not rough
     if late and finer.chi2_per_sample > REFINE_BELOW:  # so fine a density bends to physics, too
         return base
     return base if finer.choices == base.choices else finer
+
+
+def _on_last_hats(task, base, free):
+    """The fit on finer and finer hats, as long as each takes half of what those before leave."""
+    while choices := finer_hats(base.choices):
+        finer = task.fit_on(base, base.actuator, extra=free, choices=choices[0])
+        if not excess_of(finer, 1.0) < COARSE * excess_of(base, 1.0):
+            break
+        base = finer
+    return base
 
 
 def _leader_takes(base, candidates) -> float:

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from .attribute import LIKE_DENSITY, MIN_DROP, ROUGH_CHI2, SETTLED_CHI2, chi2_of, excess_of
+from .attribute import FEEDBACKS, LIKE_DENSITY, MIN_DROP, ROUGH_CHI2, SETTLED_CHI2, chi2_of, excess_of
 from .diagnosis import Evidence, misfit
 from .finer import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats, finest
 from .screen import screened
@@ -34,13 +34,31 @@ def without_chance(evidence) -> Evidence:
     return dataclasses.replace(evidence, reached=reached)
 
 
+def score_noise(result) -> float:
+    """In what unit scores count: what the finest hats leave beyond ROUGH_CHI2 acts as further noise; on others 1."""
+    return float(np.sqrt(max(result.chi2_per_sample / ROUGH_CHI2, 1.0))) if finest(result.choices) else 1.0
+
+
+def _tell_little(result) -> tuple[str, ...]:
+    """Names whose scores are a rough density's as well as their own: on the finest hats, of what bends the field, too."""
+    return (*LIKE_DENSITY, *FEEDBACKS) if finest(result.choices) else LIKE_DENSITY
+
+
+def worth_a_search(plain, candidates):
+    """The candidates; none where the finest hats leave much and nothing scores beyond what such a density does."""
+    if not finest(plain.choices) or plain.chi2_per_sample < REFINE_BELOW:
+        return candidates
+    told = max((abs(c.z) for c in candidates if c.name not in _tell_little(plain)), default=0.0)
+    return candidates if told > SECOND_Z * score_noise(plain) else []
+
+
 def _tells_nothing(evidence) -> bool:
     """Whether no effect that a density cannot pass for scores beyond what a rough one leaves, or all next to nothing of the misfit;
     not known where few are asked for."""
     if evidence.only:
         return False
-    highest = max((c.z**2 for c in evidence.candidates if c.name not in LIKE_DENSITY), default=0.0)
-    return highest < max(SECOND_Z**2, NOTHING_OF_IT * excess_of(evidence.plain))
+    highest = max((c.z**2 for c in evidence.candidates if c.name not in _tell_little(evidence.plain)), default=0.0)
+    return highest < max((SECOND_Z * score_noise(evidence.plain)) ** 2, NOTHING_OF_IT * excess_of(evidence.plain))
 
 
 def is_rough(evidence, checks) -> bool:
@@ -51,9 +69,10 @@ def is_rough(evidence, checks) -> bool:
     A smooth function could always be learned from it, and would be no physics.
     """
     steps, current = evidence.reached.steps, evidence.reached.current
+    told = finest(evidence.plain.choices)
     if not steps:
-        return evidence.excess < VERY_ROUGH_CHI2 and _tells_nothing(evidence)
-    if not evidence.excess < ROUGH_CHI2:
+        return (told or evidence.excess < VERY_ROUGH_CHI2) and _tells_nothing(evidence)
+    if not evidence.excess < (REFINE_BELOW if told else ROUGH_CHI2):
         return False
     if too_little(evidence.reached, evidence.plain):
         return True
@@ -75,11 +94,13 @@ def _clear(evidence) -> bool:
     first = evidence.reached.steps[0][0].candidate
     plain, current = evidence.plain, evidence.reached.current
     told = finest(plain.choices)
-    if first.name in LIKE_DENSITY or abs(first.z) < (SECOND_Z if told else CLEAR_Z) or plain.chi2_per_sample > REFINE_BELOW:
+    least = SECOND_Z * score_noise(plain) if told else CLEAR_Z
+    if first.name in LIKE_DENSITY or abs(first.z) < least or (plain.chi2_per_sample > REFINE_BELOW and not told):
         return False
     if evidence.share < HALF and not told:
         return False
-    return _highest_beside(current, LIKE_DENSITY if told else ()) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
+    beside = _highest_beside(current, _tell_little(plain) if told else ())
+    return beside < max(SECOND_Z * score_noise(current), NEXT_TO_IT * abs(first.z))
 
 
 def on_cells_alone(task, evidence) -> Evidence | None:

@@ -36,7 +36,7 @@ from .attribute import (
 from .check import check_errors
 from .diagnosis import SILENT_CHI2
 from .exchange import backward, commuted, exchange
-from .finer import FINER_FROM, REFINE_BESIDE, finer_hats
+from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, finest
 from .foretold import Foreteller
 from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .rows import SLOW
@@ -47,6 +47,7 @@ from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
+BEYOND_PROMISE = 3.0  # times what it promises to first order, that an effect may take
 LITTLE_LEFT = 0.2  # share of a chi2/N that an effect may leave for a finer density to be tried beside it, however far that is
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
 LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
@@ -94,6 +95,8 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
         excess = max(excess_of(state.current), MIN_DROP)
+        if state.steps and _hopeless(state.current, top[0], excess):
+            break
         trials = _trials(task, state.current, top, candidates, excess)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
@@ -132,6 +135,11 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
     if state.steps and state.current is not state.steps[-1][0].result:
         ends(state.current)
     return state
+
+
+def _hopeless(current, leader, excess) -> bool:
+    """Whether a further effect on the finest hats, where each trial takes its time, promises far less than the least that it must take."""
+    return finest(current.choices) and current.chi2_per_sample > MISFIT and BEYOND_PROMISE * leader.z**2 < LEAST_SHARE * excess
 
 
 def _trials(task, current, top, candidates, excess) -> list[Trial]:

@@ -10,7 +10,7 @@ import fitting.attribute
 import fitting.exchange
 import fitting.search
 import fitting.verdict
-from fitting.attribute import Trial, _physical, chi2_of, confidence, family, leaders, rivals_of, tie_of
+from fitting.attribute import Trial, _physical, chi2_of, confidence, excess_of, family, leaders, rivals_of, tie_of
 from fitting.diagnosis import Evidence
 from fitting.record_level import RecordEffect
 from fitting.rows import behind, creeps_on, sizes_of, ties_of
@@ -241,10 +241,27 @@ def test_a_finer_density_is_tried_beside_what_takes_nearly_all(monkeypatch, befo
 def test_what_is_left_is_put_down_to_the_density(chi2n, z, rough, like_density):
     from fitting.rough import is_rough
 
-    plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT)
+    plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices())
     scores = (candidate("accommodation", like_density), candidate("creep", z))
     evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=scores, excess=chi2n, only=())
     assert is_rough(evidence, ()) == rough
+
+
+@pytest.mark.parametrize(
+    ("chi2n", "z", "rough"), [(12.5, 13.0, True), (12.5, 30.0, False), (7.0, 10.0, True), (2.5, 7.9, True), (2.5, 12.0, False)]
+)
+@pytest.mark.parametrize("feedback", [0.0, 24.0])
+def test_what_the_finest_hats_leave_counts_as_noise(chi2n, z, rough, feedback):
+    """A null on random cells, demagnetized by the coil, leaves 12.5 there; rate_dependent_switching scores 13 and stress_feedback 24.
+    An excess_loss on cells scores 87 and leaves 18.7."""
+    from fitting.rough import is_rough, worth_a_search
+
+    plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(knots=(48, 32)))
+    scores = (candidate("stress_feedback", feedback), candidate("rate_dependent_switching", z))
+    evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=scores, excess=chi2n, only=())
+    assert is_rough(evidence, ()) == rough
+    assert bool(worth_a_search(plain, scores)) == (chi2n < 8 or not rough)
+    assert worth_a_search(SimpleNamespace(chi2_per_sample=chi2n, choices=Choices()), scores) == scores
 
 
 @pytest.mark.parametrize(
@@ -280,7 +297,7 @@ def test_what_takes_little_of_a_misfit_that_no_score_tells_of_is_dropped(name, z
     of 3.0 at z = 20 and was named."""
     from fitting.rough import without_chance
 
-    plain, current = (SimpleNamespace(chi2_per_sample=c, data_count=COUNT) for c in (2.9, ends))
+    plain, current = (SimpleNamespace(chi2_per_sample=c, data_count=COUNT, choices=Choices()) for c in (2.9, ends))
     reached = Reached(current, [(trial(name, ends), [], [], plain)], {})
     evidence = Evidence(reached, (), plain, plain, (candidate(name, z),), (), None, ((), ()), {}, {}, ())
     found = without_chance(evidence)
@@ -453,6 +470,13 @@ def test_an_effect_is_more_than_the_form_of_a_law_where_it_takes_a_whole_misfit(
     """Little above the noise another law has that form soon enough."""
     current = trial("transport_delay", before).result
     assert fitting.search._whole(current, trial("delta_e", after, base=before)) is whole
+
+
+@pytest.mark.parametrize(("knots", "left", "z", "hopeless"), [((48, 32), 5.2, 12.0, True), ((48, 32), 5.2, 30.0, False), ((48, 32), 1.2, 5.6, False), ((36, 24), 5.2, 12.0, False)])
+def test_a_further_effect_that_promises_next_to_nothing_is_not_tried_on_the_finest_hats(knots, left, z, hopeless):
+    """There a trial takes half a minute."""
+    current = SimpleNamespace(chi2_per_sample=left, data_count=COUNT, choices=Choices(knots=knots))
+    assert fitting.search._hopeless(current, candidate("creep", z), excess_of(current)) is hopeless
 
 
 def test_what_the_form_of_a_law_leaves_promises_nothing():

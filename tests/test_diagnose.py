@@ -233,7 +233,10 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
     ("plain", "score", "left", "asked", "taken"),
     [
         ((700.0, 0), 30.0, {1: 500.0, 2: 7.0, 3: 1.9}, [1, 2, "refine", 3], 3),  # the first finer hats take less than half
-        ((700.0, 0), 30.0, {1: 500.0, 2: 80.0}, [1, 2, "refine"], 0),  # and those after them leave physics
+        ((700.0, 0), 30.0, {1: 500.0, 2: 80.0, 3: 60.0}, [1, 2, "refine", 3], 0),  # and those after them leave physics
+        ((700.0, 0), 30.0, {1: 300.0, 2: 80.0, 3: 20.0}, [1, "refine", 3], 3),  # the finest take all but a little
+        ((700.0, 0), 30.0, {1: 300.0, 2: 80.0, 3: 35.0}, [1, "refine", 3], 2),  # leave much
+        ((300.0, 0), 30.0, {1: 140.0, 2: 80.0, 3: 20.0}, [1, "refine", 3], 2),  # or take less
         ((700.0, 0), 30.0, {1: 100.0, 2: 20.0, 3: 6.0}, [1, "refine", 3], 3),
         ((700.0, 0), 30.0, {1: 100.0, 2: 80.0, 3: 60.0}, [1, "refine", 3], 2),  # nor do the finest come near
         ((700.0, 0), 200.0, {}, [], 0),  # an effect promises more than half
@@ -274,8 +277,12 @@ def test_effects_are_asked_for_on_the_finest_hats_where_a_rough_density_hides_th
         ((48, 32), 7.0, 0.2, 4.0, False), ((48, 32), 12.0, 0.2, 9.0, False),
     ],
 )  # fmt: skip
-def test_what_is_clear_of_a_rough_density(monkeypatch, knots, score, share, beside, clear):
-    plain, current = a_fit(2.5, 60.0), a_fit(2.5 - 1.5 * share, 60.0, "creep")
+@pytest.mark.parametrize("times", [1.0, 8.0], ids=["near the noise", "far off"])
+def test_what_is_clear_of_a_rough_density(monkeypatch, knots, score, share, beside, clear, times):
+    """Eight times the misfit: what the finest hats leave beyond chi2/N of 3 acts as noise; on others it is physics."""
+    unit, clear = (np.sqrt(2.5 * times / 3), clear and knots == (48, 32)) if times > 1 else (1.0, clear)
+    score, beside = score * unit, beside * unit
+    plain, current = a_fit(2.5 * times, 60.0), a_fit((2.5 - 1.5 * share) * times, 60.0, "creep")
     plain.choices = current.choices = Choices(knots=knots)
     best = dataclasses.replace(trial("creep", current, 100.0), candidate=scored("creep", score))
     monkeypatch.setattr(rough_module, "screened", lambda *a: [scored("backlash", beside), scored("mean_field", 7.5)])
