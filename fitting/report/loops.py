@@ -27,7 +27,8 @@ from .style import (
 COLUMNS = 3
 WIDTH = 10.0  # inches
 SHOWN = 12  # check recordings
-LEGEND = 0.25  # inches
+LEGEND = 0.25  # inches, a line of it
+HANDLE = 2.5  # of its lines, in its font's size
 
 
 def loops(evidence, output: str, drive: str, after=None, added: str = "", stem: str = "loops"):
@@ -83,19 +84,20 @@ def checks(entries, output: str, drive: str, rows, repaired: bool = True, added:
     return _panels(panels, output, drive, stem, f"Check recordings{when}", caption, "", added)
 
 
-def _panels(panels, output, drive, stem, title, caption, detail, added=""):
+def _panels(panels, output, drive, stem, title, caption, detail, added="", lines_of_legend=1):
     factor, label, fine, unit = scale_of(output)
     drive_factor, drive_name = drive_label(drive)
     columns = min(COLUMNS, max(len(panels), 1))
     rows = int(np.ceil(len(panels) / columns))
     height = 4.05  # of a loop with its strip
     with styled():
-        total = rows * height + LEGEND
-        figure = canvas(WIDTH * max(columns, 2) / COLUMNS if columns < COLUMNS else WIDTH, total)
+        legend = LEGEND * lines_of_legend
+        total, width = rows * height + legend, WIDTH * max(columns, 2) / COLUMNS if columns < COLUMNS else WIDTH
+        figure = canvas(width, total)
         for k, (heading, loop, strips) in enumerate(panels):
             row, column = divmod(k, columns)
             left, wide = (column + 0.19) / max(columns, 2), 0.76 / max(columns, 2)
-            top = total - LEGEND - row * height
+            top = total - legend - row * height
             upper = figure.add_axes([left, (top - 2.40) / total, wide, 2.0 / total])
             lower = figure.add_axes([left, (top - 3.62) / total, wide, 0.7 / total])
             _loop(upper, loop, drive_factor, factor, heading)
@@ -109,8 +111,21 @@ def _panels(panels, output, drive, stem, title, caption, detail, added=""):
                 pairs = [p for axes in (upper, lower) for p in zip(*axes.get_legend_handles_labels(), strict=True)]
                 lines, names = zip(*pairs, strict=True)
                 names = [f"after, with {added}" if added and n == "after" else n for n in names]
-                figure.legend(lines, names, loc="upper left", bbox_to_anchor=(left, 1), ncols=4, borderaxespad=0, handlelength=2.5)
+                if (needed := int(np.ceil(_legend_width(names) / (width * (1 - left))))) > lines_of_legend:
+                    return _panels(panels, output, drive, stem, title, caption, detail, added, needed)
+                across = int(np.ceil(len(names) / lines_of_legend))
+                figure.legend(lines, names, loc="upper left", bbox_to_anchor=(left, 1), ncols=across, borderaxespad=0, handlelength=HANDLE)
         return picture(figure, stem, title, caption, detail)
+
+
+def _legend_width(names) -> float:
+    """Of a legend of one line, inches."""
+    from matplotlib import rcParams
+    from matplotlib.textpath import TextPath
+
+    size = rcParams["legend.fontsize"]
+    beside = (HANDLE + rcParams["legend.handletextpad"] + rcParams["legend.columnspacing"]) * size
+    return sum(TextPath((0, 0), name, size=size).get_extents().width + beside for name in names) / 72
 
 
 def _loop(axes, loop, drive_factor, factor, heading):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fitting.report import style
+from fitting.report import loops, style
 from fitting.report.page import kept_together
 from fitting.report.style import percent, plain, short_path, to_svg, unit_text, words
 from fitting.report.tables import aligned, checks, correlations, table, to_error
@@ -32,6 +32,24 @@ def test_numbers_as_people_write_them():
 )
 def test_values_to_the_second_digit_of_their_error(value, error, text):
     assert to_error(value, error) == text
+
+
+@pytest.mark.parametrize("panels", [1, 2, 3])
+@pytest.mark.parametrize("added", ["", "creep", "rate dependent switching", "rate dependent switching and quartic magnetostriction"])
+def test_a_legend_of_long_names_stays_in_its_figure_and_off_the_headings(monkeypatch, panels, added):
+    """Of two check recordings its end was cut off."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    phase, drawn = np.arange(8) / 8, []
+    row = {"name": "check.csv", "drive": np.sin(phase), "phase": phase, "noise": np.ones(8), **{k: phase for k in ("measured", "before", "after")}}
+    rows = [{"rms_before": 2e-7, "rms_after": 1e-7, "noise_rms": 4e-8}] * panels
+    monkeypatch.setattr(loops, "picture", lambda figure, *words: drawn.append(figure))
+    loops.checks({str(k): row for k in range(panels)}, "displacement", "current", rows, added=added)
+    figure = drawn[0]
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    legend = figure.legends[0].get_window_extent(renderer)
+    heading = max(axes.get_tightbbox(renderer).y1 for axes in figure.axes)
+    assert legend.x1 <= figure.bbox.x1 and heading < legend.y0
 
 
 def test_text_stands_out_from_its_ground():
