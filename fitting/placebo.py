@@ -11,6 +11,7 @@ import dataclasses
 from magjax.errors import ConfigurationError
 from magjax.scale import Chunk, Job, run_job
 
+from .rough import worth_a_search
 from .scale.bootstrap import model_lines, parametric_noise
 from .scale.refit import lean
 from .screen import screened
@@ -62,7 +63,7 @@ def searched(inputs, number, rng) -> dict:
     task = Task(recordings, result.bench, result.choices, actuator=result.actuator)
     base = task.fit_on(result, extra=freed_beyond(result), spectra=spectra)
     candidates = screened(base, result.choices)
-    reached = search(task, base, candidates)
+    reached = search(task, base, worth_a_search(base, candidates))
     named = [] if too_little(reached, base) else [best.name for best, *_ in reached.steps]
     return {"named": named, "highest_z": max((float(abs(c.z)) for c in candidates), default=0.0)}
 

@@ -34,22 +34,19 @@ def without_chance(evidence) -> Evidence:
     return dataclasses.replace(evidence, reached=reached)
 
 
-def score_noise(result) -> float:
-    """In what unit scores count: what the finest hats leave beyond ROUGH_CHI2 acts as further noise; on others 1."""
-    return float(np.sqrt(max(result.chi2_per_sample / ROUGH_CHI2, 1.0))) if finest(result.choices) else 1.0
-
-
-def _tell_little(result) -> tuple[str, ...]:
-    """Names whose scores are a rough density's as well as their own: on the finest hats, of what bends the field, too."""
-    return (*LIKE_DENSITY, *FEEDBACKS) if finest(result.choices) else LIKE_DENSITY
+def _told(result, candidates) -> float:
+    """The highest score of an effect that a density cannot pass for; on the finest hats in the unit of what these leave beyond
+    ROUGH_CHI2, which acts as further noise, and of a feedback, which bends the field as their steps do, what it has of CLEAR_Z."""
+    last = finest(result.choices)
+    unit, feedback = (np.sqrt(max(result.chi2_per_sample / ROUGH_CHI2, 1.0)), SECOND_Z / CLEAR_Z) if last else (1.0, 1.0)
+    scores = (abs(c.z) * (feedback if c.name in FEEDBACKS else 1.0) for c in candidates if c.name not in LIKE_DENSITY)
+    return float(max(scores, default=0.0) / unit)
 
 
 def worth_a_search(plain, candidates):
     """The candidates; none where the finest hats leave much and nothing scores beyond what such a density does."""
-    if not finest(plain.choices) or plain.chi2_per_sample < REFINE_BELOW:
-        return candidates
-    told = max((abs(c.z) for c in candidates if c.name not in _tell_little(plain)), default=0.0)
-    return candidates if told > SECOND_Z * score_noise(plain) else []
+    much = finest(plain.choices) and plain.chi2_per_sample >= REFINE_BELOW
+    return [] if much and _told(plain, candidates) < SECOND_Z else candidates
 
 
 def _tells_nothing(evidence) -> bool:
@@ -57,8 +54,9 @@ def _tells_nothing(evidence) -> bool:
     not known where few are asked for."""
     if evidence.only:
         return False
-    highest = max((c.z**2 for c in evidence.candidates if c.name not in _tell_little(evidence.plain)), default=0.0)
-    return highest < max((SECOND_Z * score_noise(evidence.plain)) ** 2, NOTHING_OF_IT * excess_of(evidence.plain))
+    highest = max((c.z**2 for c in evidence.candidates if c.name not in LIKE_DENSITY), default=0.0)
+    told = _told(evidence.plain, evidence.candidates)
+    return told < SECOND_Z or (not finest(evidence.plain.choices) and highest < NOTHING_OF_IT * excess_of(evidence.plain))
 
 
 def is_rough(evidence, checks) -> bool:
@@ -94,13 +92,14 @@ def _clear(evidence) -> bool:
     first = evidence.reached.steps[0][0].candidate
     plain, current = evidence.plain, evidence.reached.current
     told = finest(plain.choices)
-    least = SECOND_Z * score_noise(plain) if told else CLEAR_Z
-    if first.name in LIKE_DENSITY or abs(first.z) < least or (plain.chi2_per_sample > REFINE_BELOW and not told):
+    if first.name in LIKE_DENSITY or (plain.chi2_per_sample > REFINE_BELOW and not told):
         return False
-    if evidence.share < HALF and not told:
+    if (_told(plain, [first]) < SECOND_Z) if told else (abs(first.z) < CLEAR_Z or evidence.share < HALF):
         return False
-    beside = _highest_beside(current, _tell_little(plain) if told else ())
-    return beside < max(SECOND_Z * score_noise(current), NEXT_TO_IT * abs(first.z))
+    if not told:
+        return _highest_beside(current) < max(SECOND_Z, NEXT_TO_IT * abs(first.z))
+    beside = screened(current, current.choices)
+    return _told(current, beside) < SECOND_Z or _told(plain, beside) < NEXT_TO_IT * _told(plain, [first])
 
 
 def on_cells_alone(task, evidence) -> Evidence | None:
@@ -160,9 +159,9 @@ def beside_cells(task, evidence) -> Evidence | None:
     return dataclasses.replace(evidence, reached=reached, raw=cells, plain=cells, candidates=tuple(candidates))
 
 
-def _highest_beside(result, but=()) -> float:
-    """The highest score of any further effect; `but`: names that do not count."""
-    return max((abs(c.z) for c in screened(result, result.choices) if c.name not in but), default=0.0)
+def _highest_beside(result) -> float:
+    """The highest score of any further effect."""
+    return max((abs(c.z) for c in screened(result, result.choices)), default=0.0)
 
 
 def by_cells(task, evidence) -> Evidence | None:

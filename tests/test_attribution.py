@@ -257,11 +257,13 @@ def test_what_the_finest_hats_leave_counts_as_noise(chi2n, z, rough, feedback):
     from fitting.rough import is_rough, worth_a_search
 
     plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(knots=(48, 32)))
-    scores = (candidate("stress_feedback", feedback), candidate("rate_dependent_switching", z))
+    scores = (candidate("stress_feedback", feedback * np.sqrt(chi2n / 12.5)), candidate("rate_dependent_switching", z))
     evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=scores, excess=chi2n, only=())
     assert is_rough(evidence, ()) == rough
     assert bool(worth_a_search(plain, scores)) == (chi2n < 8 or not rough)
     assert worth_a_search(SimpleNamespace(chi2_per_sample=chi2n, choices=Choices()), scores) == scores
+    strong = [candidate("stress_feedback", 60.0), candidate("mean_field", 90.0)]
+    assert worth_a_search(plain, strong) == strong and not worth_a_search(plain, strong[1:]) or chi2n < 8
 
 
 @pytest.mark.parametrize(
