@@ -22,7 +22,7 @@ from .attribute import (
 )
 from .check import check_errors
 from .diagnosis import Diagnosis, Evidence, misfit
-from .finer import FINER_FROM, REFINE_BELOW, finer_hats, finest, hats_of_step
+from .finer import FINER_FROM, FINEST_BELOW, REFINE_BELOW, finer_hats, finest, hats_of_step
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
@@ -44,7 +44,7 @@ COARSE = 0.5  # of a misfit, that a finer density may leave where the first one 
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
-ALL_BUT, FINEST_BELOW = 0.05, 30.0  # share of a misfit that the finest hats may leave, and chi2/N, to be gone on with above REFINE_BELOW
+ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
@@ -297,10 +297,10 @@ def _on_finer_hats(task, base, free):
         else:
             return base
     finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=UNEXPLAINED)
-    rough = _on_last_hats(task, finer, free) if finer.chi2_per_sample > UNEXPLAINED else finer
-    if finest(rough.choices) and REFINE_BELOW < rough.chi2_per_sample < FINEST_BELOW:
-        finer = rough if excess_of(rough, 1.0) < ALL_BUT * excess_of(base, 1.0) else finer
-        late = late and finer is not rough
+    last = _on_last_hats(task, finer, free) if finer.chi2_per_sample > UNEXPLAINED else finer
+    highest = FINEST_BELOW if excess_of(last, 1.0) < ALL_BUT * excess_of(base, 1.0) else REFINE_BELOW
+    if finest(last.choices) and last.chi2_per_sample < highest:
+        return last
     if late and finer.chi2_per_sample > REFINE_BELOW:  # so fine a density bends to physics, too
         return base
     return base if finer.choices == base.choices else finer

@@ -132,15 +132,16 @@ def separations(trials, drives, spectra):
 def _predicted(result, drives, spectra):
     """Whitened harmonics of the drives, (drives, numbers), their Jacobian, (drives, numbers, unknowns), and the fit's covariance.
 
-    By the programs of the fits, and as many drives at once as there were recordings.
+    By the programs of the fits, and so as many drives at once as there were recordings, the last repeated.
     """
     problem, solution, coarse = result.problem, result.refined, result.problem.predictors[0]
-    wanted, memories = [_asked(spectra[0], *drive) for drive in drives], problem.layout.memories
-    z, most = np.array(solution.z), memories or len(wanted)
-    shared = len(z) - memories
+    like, memories = max(spectra, key=lambda s: len(s.reading)), problem.layout.memories
+    wanted, z = [_asked(like, *drive) for drive in drives], np.array(solution.z)
+    shared, most = len(z) - memories, memories or len(wanted)
     z[shared:] = 0.0
+    wanted += wanted[-1:] * (-len(wanted) % most)
     rows = [_rows_of(problem, z, wanted[at : at + most], coarse) for at in range(0, len(wanted), most)]
-    r, J = (np.concatenate(part) for part in zip(*rows, strict=True))
+    r, J = (np.concatenate(part)[: len(drives)] for part in zip(*rows, strict=True))
     return r, J[..., :shared], covariance(solution.normal, solution.z, problem.layout)[:shared, :shared]
 
 

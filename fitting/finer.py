@@ -17,6 +17,7 @@ FINER_FROM = (1.05, 1.5, 2.0)  # chi2/N from which each step is tried,
 FINER_TAKES = (0.7, 0.5, 0.5)  # and the share of the excess that it may leave
 CELLS_MEET = 1.25  # chi2/N that cells must reach too: they take up physics, but not all of it
 REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
+FINEST_BELOW = 30.0  # the same of the finest hats
 REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be the density
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 

@@ -232,9 +232,10 @@ def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.in
 def _quoted(problem, solution, choices, bench, recordings, fitted, per_recording, target) -> Quoted:
     """The parameters with a tenth of the roughness weights (but of a fit that missed its `target`), and the outcome in words."""
     chi2n = solution.chi2 / problem.data_count
-    refined = solution
+    refined, stopped = solution, False
     if chi2n < 20 and not solution.chi2 > target:
-        refined = solve(problem, solution.z, UNDERSMOOTH * solution.weights, max_jacobians=4, evidence=False)
+        found = solve(problem, solution.z, UNDERSMOOTH * solution.weights, max_jacobians=4, evidence=False)
+        refined, stopped = (solution, True) if found.interrupted else (found, False)
     rows = estimates(problem, refined, _actuator_at(problem.layout, problem.template, jnp.asarray(refined.z)))
     related = correlations(problem, refined)
     message = (
@@ -247,4 +248,4 @@ def _quoted(problem, solution, choices, bench, recordings, fitted, per_recording
         + beyond_the_rod(problem.spectra, fitted, bench)
         + contradicted(bench, choices)
     )
-    return Quoted(refined, tuple(rows), related, message)
+    return Quoted(refined, tuple(rows), related, message, stopped)

@@ -28,12 +28,13 @@ class RecordingFit:
 
 @dataclasses.dataclass(frozen=True)
 class Quoted:
-    """What a fit says of its parameters, and the solution that they are `refined` from."""
+    """What a fit says of its parameters, and the solution that they are `refined` from, the fit's own where Ctrl-C stopped that."""
 
     refined: object
     estimates: tuple
     correlations: dict
     message: str
+    interrupted: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

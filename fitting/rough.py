@@ -6,7 +6,7 @@ import numpy as np
 
 from .attribute import FEEDBACKS, LIKE_DENSITY, MIN_DROP, ROUGH_CHI2, SETTLED_CHI2, chi2_of, excess_of
 from .diagnosis import Evidence, misfit
-from .finer import FINER_FROM, REFINE_BELOW, cells_beside, finer_hats, finest
+from .finer import FINER_FROM, FINEST_BELOW, REFINE_BELOW, cells_beside, finer_hats, finest
 from .screen import screened
 from .search import SECOND_Z, search
 from .setup import Choices
@@ -44,9 +44,10 @@ def _told(result, candidates) -> float:
 
 
 def worth_a_search(plain, candidates):
-    """The candidates; none where the finest hats leave much and nothing scores beyond what such a density does."""
-    much = finest(plain.choices) and plain.chi2_per_sample >= REFINE_BELOW
-    return [] if much and _told(plain, candidates) < SECOND_Z else candidates
+    """The candidates; none where the finest hats leave much and nothing scores beyond what such a density does, but where few are
+    asked for."""
+    much = finest(plain.choices) and REFINE_BELOW <= plain.chi2_per_sample < FINEST_BELOW
+    return [] if much and not plain.choices.only and _told(plain, candidates) < SECOND_Z else candidates
 
 
 def _tells_nothing(evidence) -> bool:
@@ -60,8 +61,8 @@ def _tells_nothing(evidence) -> bool:
 
 
 def is_rough(evidence, checks) -> bool:
-    """Whether what is left is the density's: little, and nothing scores beyond what a rough one leaves and nothing earned its
-    place; or what earned it is clear of any density; or a finer density was asked for and what is named foretells the check
+    """Whether what is left is the density's: little (on the finest hats FINEST_BELOW), and nothing scores beyond what a rough one
+    leaves and nothing earned its place; or what earned it is clear of any density; or a finer density was asked for and what is named foretells the check
     recordings, which took no part (without any, it must explain all but a little).
 
     A smooth function could always be learned from it, and would be no physics.
@@ -69,7 +70,7 @@ def is_rough(evidence, checks) -> bool:
     steps, current = evidence.reached.steps, evidence.reached.current
     told = finest(evidence.plain.choices)
     if not steps:
-        return (told or evidence.excess < VERY_ROUGH_CHI2) and _tells_nothing(evidence)
+        return evidence.excess < (FINEST_BELOW if told else VERY_ROUGH_CHI2) and _tells_nothing(evidence)
     if not evidence.excess < (REFINE_BELOW if told else ROUGH_CHI2):
         return False
     if too_little(evidence.reached, evidence.plain):
@@ -88,7 +89,7 @@ def is_rough(evidence, checks) -> bool:
 def _clear(evidence) -> bool:
     """Whether what was found scored far beyond what a rough density ever leaves, takes most of a misfit that one may leave, and
     leaves nothing that scores beyond that, or next to what it scored itself. On the finest hats, where a rough density scores next
-    to nothing, it need not take most."""
+    to nothing, it need not take most (scores as in `_told`)."""
     first = evidence.reached.steps[0][0].candidate
     plain, current = evidence.plain, evidence.reached.current
     told = finest(plain.choices)

@@ -253,7 +253,7 @@ def screen(problem, solution) -> list[Candidate]:
 
 def screened(result, choices) -> list:
     """Every effect that may be asked for, best first."""
-    if result.refined.interrupted:
+    if result.quoted.interrupted:
         raise KeyboardInterrupt
     found = [c for c in screen(result.problem, result.refined) if c.name not in choices.without]
     found = [c for c in found if c.name in choices.only] if choices.only else found

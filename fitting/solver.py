@@ -263,7 +263,7 @@ def bounded_minimum(A, gradient, y, bounds, near=None) -> np.ndarray:
     A = A * scale[:, None] * scale[None, :]
     g = gradient * scale
     walls = tuple(np.clip((bound - y) / scale, -1e300, 1e300) for bound in bounds)
-    near = y if near is None else near
+    near = y if near is None or not np.isfinite(near).all() else near
     side = first = (near >= bounds[1]) * 1 - (near <= bounds[0]) * 1
     d, side, ended = _pivoted(A, g, walls, side)
     if not ended:

@@ -256,12 +256,18 @@ def test_what_the_finest_hats_leave_counts_as_noise(chi2n, z, rough, feedback):
     An excess_loss on cells scores 87 and leaves 18.7."""
     from fitting.rough import is_rough, worth_a_search
 
-    plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(knots=(48, 32)))
+    finest = Choices(knots=(48, 32))
+    plain = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=finest)
     scores = (candidate("stress_feedback", feedback * np.sqrt(chi2n / 12.5)), candidate("rate_dependent_switching", z))
     evidence = SimpleNamespace(reached=Reached(plain, [], {}), plain=plain, candidates=scores, excess=chi2n, only=())
     assert is_rough(evidence, ()) == rough
     assert bool(worth_a_search(plain, scores)) == (chi2n < 8 or not rough)
     assert worth_a_search(SimpleNamespace(chi2_per_sample=chi2n, choices=Choices()), scores) == scores
+    asked = dataclasses.replace(finest, only=("creep",))
+    assert worth_a_search(SimpleNamespace(chi2_per_sample=chi2n, choices=asked), scores) == scores
+    far = SimpleNamespace(chi2_per_sample=300.0, data_count=COUNT, choices=finest)
+    assert worth_a_search(far, scores) == scores
+    assert not is_rough(SimpleNamespace(reached=Reached(far, [], {}), plain=far, candidates=scores, excess=300.0, only=()), ())
     strong = [candidate("stress_feedback", 60.0), candidate("mean_field", 90.0)]
     assert worth_a_search(plain, strong) == strong and not worth_a_search(plain, strong[1:]) or chi2n < 8
 

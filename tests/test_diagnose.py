@@ -235,7 +235,11 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
         ((700.0, 0), 30.0, {1: 500.0, 2: 7.0, 3: 1.9}, [1, 2, "refine", 3], 3),  # the first finer hats take less than half
         ((700.0, 0), 30.0, {1: 500.0, 2: 80.0, 3: 60.0}, [1, 2, "refine", 3], 0),  # and those after them leave physics
         ((700.0, 0), 30.0, {1: 300.0, 2: 80.0, 3: 20.0}, [1, "refine", 3], 3),  # the finest take all but a little
+        ((700.0, 0), 30.0, {1: 300.0, 2: 80.0, 3: 6.0}, [1, "refine", 3], 3),  # all the more so
         ((700.0, 0), 30.0, {1: 300.0, 2: 80.0, 3: 35.0}, [1, "refine", 3], 2),  # leave much
+        # 0: what refines reaches the finest itself, which take a fifth or all but a little
+        ((100.0, 0), 30.0, {1: 60.0, 2: 45.0, 3: 20.0, 0: None}, [1, 2, "refine"], 0),
+        ((900.0, 0), 30.0, {1: 600.0, 2: 45.0, 3: 20.0, 0: None}, [1, 2, "refine"], 3),
         ((300.0, 0), 30.0, {1: 140.0, 2: 80.0, 3: 20.0}, [1, "refine", 3], 2),  # or take less
         ((700.0, 0), 30.0, {1: 100.0, 2: 20.0, 3: 6.0}, [1, "refine", 3], 3),
         ((700.0, 0), 30.0, {1: 100.0, 2: 80.0, 3: 60.0}, [1, "refine", 3], 2),  # nor do the finest come near
@@ -258,7 +262,7 @@ def test_effects_are_asked_for_on_the_finest_hats_where_a_rough_density_hides_th
 
     def fit_on(task, start, *a, choices, refine=False, **more):
         steps.append("refine" if refine else hats.index(choices.knots))
-        step = max(hats.index(start.choices.knots), 2) if refine else hats.index(choices.knots)
+        step = max(hats.index(start.choices.knots), 2 + (0 in left)) if refine else hats.index(choices.knots)
         return fitted(left[step], step)
 
     steps, base = [], fitted(*plain)

@@ -24,6 +24,7 @@ from fitting.fit import fit
 from fitting.joint import data_residual
 from fitting.outcome import beyond_the_rod, guessed, loose, valleys
 from fitting.recipe import recipe_beside
+from fitting.screen import screened
 from fitting.setup import Choices, build_problem, free_parameters, spectra_of
 from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
@@ -217,10 +218,27 @@ def test_a_fit_that_misses_its_target_is_not_quoted_anew(recordings, bench, resu
     assert np.allclose(met.refined.weights, 0.1 * met.solution.weights)
 
 
+def test_ctrl_c_while_a_fit_is_quoted_leaves_what_the_fit_itself_knows(monkeypatch, recordings, bench, result):
+    """Stopped in its first Jacobian a further fit knows the prior alone: R_eddy was 64 +- 8323 ohm."""
+    again = fit(
+        recordings, bench, actuator=result.actuator, start=result, choices=result.choices, spectra=result.spectra, refine=False
+    )
+    monkeypatch.setattr("fitting.joint.data_jacobian", interrupt)
+    assert again.quoted.interrupted and again.refined is again.solution
+    assert again.estimate("coil.R_eddy").stderr < 3 * result.estimate("coil.R_eddy").stderr
+    with pytest.raises(KeyboardInterrupt):
+        screened(again, result.choices)
+
+
+def interrupt(*arguments):
+    raise KeyboardInterrupt
+
+
 def test_drives_that_are_asked_for_are_predicted_by_the_programs_of_the_fit(result):
     """More of them than recordings, which have levels of M of their own; what they do to the reading is a simulation of the drive."""
     drives = [(f, 0.35, 0.1) for f in (5.0, 20.0, 60.0, 120.0, 240.0)]
-    r, J, known = _predicted(result, drives, result.spectra)
+    few = dataclasses.replace(result.spectra[0], drive=result.spectra[0].drive[:5], reading=result.spectra[0].reading[:5])
+    r, J, known = _predicted(result, drives, (few, *result.spectra[1:]))
     layout, z, template = result.problem.layout, result.refined.z, result.problem.template
     shared, count, samples = layout.size - layout.memories, 41, result.problem.predictors[0].drives[0].shape[1]
     assert r.shape == (5, 2 * count - 1) and J.shape == (*r.shape, shared) and known.shape == (shared, shared)

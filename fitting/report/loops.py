@@ -29,6 +29,7 @@ WIDTH = 10.0  # inches
 SHOWN = 12  # check recordings
 LEGEND = 0.25  # inches, a line of it
 HANDLE = 2.5  # of its lines, in its font's size
+HINTED = 1.08  # times its width that a text takes where it is drawn in pixels
 
 
 def loops(evidence, output: str, drive: str, after=None, added: str = "", stem: str = "loops"):
@@ -111,21 +112,22 @@ def _panels(panels, output, drive, stem, title, caption, detail, added="", lines
                 pairs = [p for axes in (upper, lower) for p in zip(*axes.get_legend_handles_labels(), strict=True)]
                 lines, names = zip(*pairs, strict=True)
                 names = [f"after, with {added}" if added and n == "after" else n for n in names]
-                if (needed := int(np.ceil(_legend_width(names) / (width * (1 - left))))) > lines_of_legend:
-                    return _panels(panels, output, drive, stem, title, caption, detail, added, needed)
                 across = int(np.ceil(len(names) / lines_of_legend))
+                if across > 1 and _legend_width(names, across) > width * (1 - left):
+                    return _panels(panels, output, drive, stem, title, caption, detail, added, lines_of_legend + 1)
                 figure.legend(lines, names, loc="upper left", bbox_to_anchor=(left, 1), ncols=across, borderaxespad=0, handlelength=HANDLE)
         return picture(figure, stem, title, caption, detail)
 
 
-def _legend_width(names) -> float:
-    """Of a legend of one line, inches."""
+def _legend_width(names, columns: int) -> float:
+    """Of a legend of so many columns, inches."""
     from matplotlib import rcParams
     from matplotlib.textpath import TextPath
 
     size = rcParams["legend.fontsize"]
     beside = (HANDLE + rcParams["legend.handletextpad"] + rcParams["legend.columnspacing"]) * size
-    return sum(TextPath((0, 0), name, size=size).get_extents().width + beside for name in names) / 72
+    widths = [HINTED * TextPath((0, 0), name, size=size).get_extents().width + beside for name in names]
+    return sum(max(column) for column in np.array_split(widths, columns)) / 72
 
 
 def _loop(axes, loop, drive_factor, factor, heading):

@@ -34,8 +34,11 @@ def test_values_to_the_second_digit_of_their_error(value, error, text):
     assert to_error(value, error) == text
 
 
+LONG = "rate dependent switching and quartic magnetostriction and reversible magnetization"
+
+
 @pytest.mark.parametrize("panels", [1, 2, 3])
-@pytest.mark.parametrize("added", ["", "creep", "rate dependent switching", "rate dependent switching and quartic magnetostriction"])
+@pytest.mark.parametrize("added", ["", "creep", "second eddy path", "rate dependent switching", "creep and delta e", LONG])
 def test_a_legend_of_long_names_stays_in_its_figure_and_off_the_headings(monkeypatch, panels, added):
     """Of two check recordings its end was cut off."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
