@@ -279,9 +279,9 @@ def _screened_finer(task, base, candidates, free):
     last = hats_of_step(base.choices, task.bench, 2)
     rough = last and base.choices.knots != task.choices.knots and FINER_FROM[1] < base.chi2_per_sample < UNEXPLAINED
     if rough and _leader_takes(base, candidates) < HALF:
-        finest = task.fit_on(base, base.actuator, extra=free, choices=last[0])
-        if finest.chi2_per_sample < REFINE_BELOW and excess_of(finest, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
-            return finest, screened(finest, task.choices)
+        finer = task.fit_on(base, base.actuator, extra=free, choices=last[0])
+        if finer.chi2_per_sample < REFINE_BELOW and excess_of(finer, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
+            return finer, screened(finer, task.choices)
     return base, candidates
 
 
