@@ -1,8 +1,5 @@
-"""How small changes inside the chain reach the reading, to first order: what the screening and the learned terms share.
-
-Two linear maps, each compiled for what it depends on and no more: from what is added to every step of (4), or to the drive, to the
-field and the magnetization (effects before the magnetostriction), and from changes of signals to the reading's lines (all
-effects). What an effect that is asked for does at its own block depends on none of those that the actuator has.
+"""What an effect that is asked for does at its own block, to first order: what it adds to every step of (4), to the drive, or to the
+signals behind the march. It depends on none of those that the actuator has; how it reaches the reading is told by `adjoint.Rows`.
 """
 
 import dataclasses
@@ -14,11 +11,8 @@ import numpy as np
 from magjax.chain import Timeline
 from magjax.chain.coupled import disturbance_of
 from magjax.chain.march import magnetize
-from magjax.effects.base import AbstractEffect
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain
-
-AT_ONCE = 8  # columns pushed through a map side by side
 
 
 def marching(actuator):
@@ -31,29 +25,19 @@ def bare(actuator):
     return dataclasses.replace(actuator, effects=())
 
 
-def _march(predictor, actuator, drive, dt, added=None, change=None):
-    """(4) over all periods that the predictor runs: field, magnetization and current of the last one; relay field, magnetization and
-    current of all."""
-    current = driven_current(actuator, drive, Timeline(dt, drive.shape[0], True))
-    if change is not None:
-        current = current + change
-    memory = actuator.hysteresis.memory(actuator.hysteresis.table(), predictor.corners)
-    whole = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
-    count = len(current)
-    H, M, v, _, _ = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, added, count)
-    unreached = actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
-    last = (H[-count - 1 : -1], M[-count - 1 : -1] + unreached, current)
-    return last, (v, M, whole[1])
-
-
 @kept
 def trajectory(predictor, actuator):
     """The march of every recording, per grid: (field, magnetization) of the last period, (recordings, samples), and (relay field,
     magnetization, coil current, step) of all periods, (recordings, time)."""
 
     def one(drive, dt):
-        (H, M, _), whole = _march(predictor, actuator, drive, dt)
-        return (H, M), (*whole, dt)
+        current = driven_current(actuator, drive, Timeline(dt, drive.shape[0], True))
+        memory = actuator.hysteresis.memory(actuator.hysteresis.table(), predictor.corners)
+        whole = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
+        count = len(current)
+        H, M, v, _, _ = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, period=count)
+        unreached = actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
+        return (H[-count - 1 : -1], M[-count - 1 : -1] + unreached), (v, M, whole[1], dt)
 
     rows = [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
     return [row[0] for row in rows], [row[1] for row in rows]
@@ -84,23 +68,6 @@ def drive_change(effect, predictor, actuator):
         return jax.jvp(lambda a: effect.with_amplitude(a).drive(drive, line, actuator), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
     return tuple(jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True))
-
-
-@kept
-def through_march(predictor, actuator, added, changes):
-    """First-order change of field, magnetization and current, per grid, (columns, recordings, samples) each.
-
-    `added`: to every step, per grid 3 of (columns, recordings, time), see `magnetize`; `changes`: of the current, per grid,
-    (columns, recordings, samples).
-    """
-
-    def fields_of(added, changes):
-        grids = zip(predictor.drives, predictor.steps, added, changes, strict=True)
-        return tuple(jax.vmap(lambda *given: _march(predictor, actuator, *given)[0])(*g) for g in grids)
-
-    origin = jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), (added, changes))
-    _, push = jax.linearize(fields_of, *origin)
-    return jax.lax.map(lambda d: push(*d), (added, changes), batch_size=AT_ONCE)
 
 
 @kept
@@ -148,47 +115,3 @@ def late_change(effects, predictor, actuator, signals):
 
     over = jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, None))
     return tuple(over(effects, s, dt) for s, dt in zip(signals, predictor.steps, strict=True))
-
-
-class _Added(AbstractEffect):
-    """Signals added behind the hysteresis, (time,): to the free displacement, the displacement, the reading."""
-
-    free: jax.Array
-    moved: jax.Array
-    read: jax.Array
-
-    def strain(self, free_displacement, magnetization, field, line, actuator):
-        return free_displacement + self.free
-
-    def displacement(self, displacement, free_displacement, signals, line, actuator):
-        return displacement + self.moved
-
-    def reading(self, reading, signals, line, actuator):
-        return reading + self.read
-
-
-@kept
-def to_lines(predictor, actuator, fields, changes, late):
-    """First-order change of the reading's lines by changes of signals, (columns, recordings, harmonics + 1).
-
-    `fields`: of `trajectory`. Per grid, `changes`: of field, magnetization, current, or None; `late`: of free displacement, displacement,
-    reading; (columns, recordings, samples) each.
-    """
-
-    def lines(changes, late):
-        def one(drive, dt, given, change, late):
-            line, zero = Timeline(dt, drive.shape[0], True), jnp.zeros(())
-            H, M, current = (*given, driven_current(actuator, drive, line))
-            if change is not None:
-                H, M, current = H + change[0], M + change[1], current + change[2]
-            changed = dataclasses.replace(actuator, effects=(*actuator.effects, _Added(*late)))
-            s = finish_chain(changed, line, drive, current, H, M, H, zero, zero)
-            return jnp.fft.rfft(s.reading)[: predictor.harmonics + 1] / drive.shape[0]
-
-        changes = [None] * len(late) if changes is None else changes
-        grids = zip(predictor.drives, predictor.steps, fields, changes, late, strict=True)
-        return jnp.concatenate([jax.vmap(one)(*g) for g in grids])[np.asarray(predictor.index)]
-
-    origin = jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), (changes, late))
-    _, push = jax.linearize(lines, *origin)
-    return jax.lax.map(lambda d: push(*d), (changes, late), batch_size=AT_ONCE)

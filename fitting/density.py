@@ -19,7 +19,7 @@ from magjax.errors import ConfigurationError
 R_EXPONENT = 1.6
 TAIL = 0.5
 RIDGE = 0.3  # beside second differences
-COLUMNS = 114  # unknowns that a program takes at once: none depends on how many there are
+AT_ONCE = 100  # unknowns whose planes are in memory side by side
 
 
 def on_device(values):
@@ -47,13 +47,13 @@ class Hats(eqx.Module):
         flat = jnp.zeros(self.size**2).at[self.places].add(self.shares * x[self.unknowns])
         return flat.reshape(self.size, self.size)
 
-    def each(self, first: int) -> np.ndarray:
-        """Masses of `COLUMNS` unknowns from number `first` on, none for those that there are not, (COLUMNS, size, size)."""
+    def each(self, first: int, count: int) -> np.ndarray:
+        """Masses of so many unknowns from number `first` on, (count, size, size)."""
         shares, places, unknowns = (np.asarray(k) for k in (self.shares, self.places, self.unknowns))
-        mine = slice(*np.searchsorted(unknowns, (first, first + COLUMNS)))
-        cubes = np.zeros((COLUMNS, self.size**2))
+        mine = slice(*np.searchsorted(unknowns, (first, first + count)))
+        cubes = np.zeros((count, self.size**2))
         cubes[unknowns[mine] - first, places[mine]] = shares[mine]
-        return cubes.reshape(COLUMNS, self.size, self.size)
+        return cubes.reshape(count, self.size, self.size)
 
 
 def everett_values(masses: np.ndarray) -> np.ndarray:
@@ -93,9 +93,30 @@ class DensityBasis:
         return Hats(on_device(entries.data), places, unknowns, self.size)
 
     @functools.cached_property
-    def tables(self) -> tuple[jax.Array, ...]:
-        """Everett values of the unknowns, `COLUMNS` at a time, (COLUMNS, levels, levels): every fit on this basis shares them."""
-        return tuple(on_device(everett_values(self.hats.each(k))) for k in range(0, self.unknowns, COLUMNS))
+    def values(self) -> np.ndarray:
+        """Everett values of every unknown at a total mass of 1, (levels^2, unknowns): every fit on this basis shares them."""
+        found = np.empty(((self.size + 1) ** 2, self.unknowns))
+        for first in range(0, self.unknowns, AT_ONCE):
+            count = min(AT_ONCE, self.unknowns - first)
+            found[:, first : first + count] = everett_values(self.hats.each(first, count)).reshape(count, -1).T
+        return found
+
+    def everett(self, alpha, beta) -> np.ndarray:
+        """T(alpha, beta) of every unknown at a total mass of 1, (points, unknowns), as `EverettTable` has it."""
+        L = self.size
+        step = (self.high - self.low) / L
+
+        def locate(field):
+            place = np.clip((np.asarray(field) - self.low) / step, 0, L)
+            cell = np.clip(np.floor(place), 0, L - 1).astype(np.int64)
+            return cell, place - cell
+
+        (i, p), (j, q), width = locate(alpha), locate(beta), L + 1
+        corner = i * width + j
+        places = np.stack([corner, corner + 1, corner + width, corner + width + 1, i * width + i + 1, j * width + j + 1], axis=1)
+        shares = np.stack([(1 - p) * (1 - q), (1 - p) * q, p * (1 - q), p * q, -p * (1 - p), -q * (1 - q)], axis=1)
+        rows = csr_array((shares.ravel(), places.ravel(), np.arange(0, shares.size + 1, 6)), (len(shares), width**2))
+        return rows @ self.values
 
     @property
     def unknowns(self) -> int:

@@ -64,11 +64,6 @@ class Problem:
         """Roughness of the density: a sparse matrix of second differences a family."""
         return self.basis.penalties
 
-    @property
-    def tables(self) -> tuple:
-        """Everett values of the density's unknowns, see `DensityBasis.tables`."""
-        return self.basis.tables
-
     @functools.cached_property
     def passes(self) -> Passes:
         """Its residual and Jacobian."""

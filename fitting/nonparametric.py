@@ -8,7 +8,6 @@ jointly with everything else, and the term is kept only where recordings left ou
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +18,8 @@ from magjax.effects.learned_term import PAD, LearnedTerm
 from magjax.programs import kept
 from magjax.simulate import run_chain
 
-from .columns import marching, through_march, to_lines, trajectory
+from .adjoint import as_lines
+from .columns import marching, trajectory
 from .model import whitened
 from .screen import Projector
 
@@ -134,12 +134,17 @@ def null_term(block, variables, signals, actuator, counts) -> LearnedTerm:
 
 @kept
 def _moved(predictor, actuator, force):
-    """Displacement by a force behind the hysteresis, given as the static displacement, m, (columns, recordings, samples) per grid."""
+    """Displacement by a force behind the hysteresis, given as the static displacement, m, (columns, recordings, samples)."""
 
     def one(force, dt):
         return Timeline(dt, force.shape[0], True).filter(force, actuator.mechanics.response)
 
-    return tuple(jax.vmap(jax.vmap(one), (0, None))(f, dt) for f, dt in zip(force, predictor.steps, strict=True))
+    return jax.vmap(jax.vmap(one), (0, None))(force, predictor.steps[0])
+
+
+def _filled(waves, number):
+    """Waves of so many recordings, the last repeated, (columns, number, samples)."""
+    return waves[:, np.minimum(np.arange(number), waves.shape[1] - 1)]
 
 
 class Tangents:
@@ -151,44 +156,49 @@ class Tangents:
         self.predictor = self.problem.predictors[0]
         self.projector = Projector(self.problem, self.solution)
         self.fine = self.problem.predictors[1]  # a sharp function needs its samples
-        self.last = _signals(self.fine, self.actuator)
-        self.signals = {n: np.concatenate([np.asarray(g[n]).ravel() for g in self.last]) for n in self.last[0]}
-        self.states = [(g["coil_field"], g["magnetization"]) for g in self.last]
-        self.fields, self.trajectory = trajectory(self.predictor, marching(self.actuator))
-        self.marched = [_step_signals(self.actuator.coil.scheme, *(np.asarray(x) for x in part)) for part in self.trajectory]
-        self.zero = eqx.tree_at(lambda t: t.lines, self.problem.target, jnp.zeros_like(self.problem.target.lines))
+        passes, z = self.problem.passes, self.solution.z
+        self.target = dataclasses.replace(passes.target, lines=np.zeros_like(passes.target.lines))
+        self.rows, self.marched = [], []
+        for part, places, rows in passes.rows(z):
+            path = trajectory(part, marching(self.actuator))[1][0]
+            self.marched.append(_step_signals(self.actuator.coil.scheme, *(np.asarray(x)[: len(places)] for x in path)))
+            self.rows.append(rows)
+        self.parts = list(self.fine.batches())
+        self.read = []
+        self.last = []
+        for part, places in self.parts:
+            (signals,) = _signals(part, self.actuator)
+            read = passes.read_rows(z, part, (signals["coil_field"], signals["magnetization"]))[0]
+            self.read.append(np.asarray(read)[: len(places)])
+            self.last.append({n: np.asarray(x)[: len(places)] for n, x in signals.items()})
+        self.signals = {n: np.concatenate([g[n].ravel() for g in self.last]) for n in self.last[0]}
 
     def columns(self, term) -> np.ndarray:
         """d (whitened misfit) / d coefficients, (data, coefficients)."""
-        p, a = self.predictor, self.actuator
         if term.in_step:
-            waves = [float(term.size) * self._waves(term, g) for g in self.marched]
-            still = [np.zeros_like(w) for w in waves]
             at = 2 if term.place == "coil" else 0
-            rows = tuple(tuple(w if k == at else z for k in range(3)) for w, z in zip(waves, still, strict=True))
-            changes = tuple(np.zeros((len(term.coefficients), *d.shape)) for d in p.drives)
-            lines = self._early(rows, changes)
+            lines = [
+                rows.of_steps(*(float(term.size) * self._waves(term, own) if k == at else None for k in range(3)))
+                for rows, own in zip(self.rows, self.marched, strict=True)
+            ]
         else:
-            waves = tuple(float(term.size) * self._waves(term, g) for g in self.last)
+            waves = [float(term.size) * self._waves(term, own) for own in self.last]
             if term.place == "source":
-                waves = tuple(w[:, :, :: w.shape[2] // d.shape[1]] for w, d in zip(waves, p.drives, strict=True))
-                shapes = [(len(w), *np.shape(part[0])) for w, part in zip(waves, self.trajectory, strict=True)]
-                lines = self._early(tuple(tuple(np.zeros(shape) for _ in range(3)) for shape in shapes), waves)
+                coarse = [rows.signals.shape[3] for rows in self.rows]
+                lines = [rows.of_drive(w[:, :, :: w.shape[2] // n]) for rows, w, n in zip(self.rows, waves, coarse, strict=True)]
             else:
-                at = ("magnetostriction", "mechanics", "sensor").index(term.place)
-                waves = _moved(self.fine, a, waves) if term.place == "mechanics" else waves
-                given = tuple(tuple(w if k == at else np.zeros(w.shape) for k in range(3)) for w in waves)
-                lines = to_lines(self.fine, a, self.states, None, given)
-        return np.stack([np.asarray(whitened(line, self.zero)) for line in lines], axis=1)
-
-    def _early(self, added, changes):
-        """Columns of what is added to every step, or to the drive."""
-        changed = through_march(self.predictor, marching(self.actuator), added, changes)
-        none = tuple((np.zeros(x.shape),) * 3 for x, *_ in changed)
-        return to_lines(self.predictor, self.actuator, self.fields, changed, none)
+                at = 3 + ("magnetostriction", "mechanics", "sensor").index(term.place)
+                if term.place == "mechanics":
+                    waves = [
+                        np.asarray(_moved(part, self.actuator, _filled(w, len(part.index))))[:, : w.shape[1]]
+                        for (part, _), w in zip(self.parts, waves, strict=True)
+                    ]
+                lines = [np.einsum("rln,crn->crl", read[:, :, at], w, optimize=True) for read, w in zip(self.read, waves, strict=True)]
+        lines = as_lines(np.concatenate(lines, axis=1)[:, np.asarray(self.predictor.index)])
+        return whitened(lines, self.target, np).T
 
     def _waves(self, term, signals):
-        return term.basis(*(np.asarray(signals[v]) for v in term.variables), xp=np)[0]
+        return term.basis(*(signals[v] for v in term.variables), xp=np)[0]
 
     def project(self, columns) -> np.ndarray:
         """The part of data columns that the fit cannot make."""

@@ -1,8 +1,8 @@
 """The chain and its derivatives by programs that all fits share.
 
 What is compiled knows neither how many recordings there are, nor the density, nor what is free: whole ROWS of recordings go
-through at once, and COLUMNS of the unknowns. Once a bench was fitted, the next one, a further recording, finer hats on the
-same plane and a parameter of an effect set free ask for nothing that is not there.
+through at once, and their lines are led back (`adjoint`). Once a bench was fitted, the next one, a further recording, finer hats on
+the same plane and a parameter of an effect set free ask for nothing that is not there.
 """
 
 import dataclasses
@@ -13,14 +13,13 @@ import numpy as np
 
 from magjax.programs import kept
 
+from .adjoint import as_lines, marched_steps, read_rows, rows_of
 from .columns import marching
-from .density import COLUMNS
 from .model import MEMORY, Target, whitened
-from .solver import pushed
 
 
 class Point(eqx.Module):
-    """Where a program is to stand, or a direction there (a leading axis of columns on each).
+    """Where a program is to stand.
 
     `masses`: A/m, (L, L), with their Everett `values`, A/m, (L + 1, L + 1), None where they are held; `offset`: of M, A/m;
     `parameters`: SI, in the order of the names beside it; `levels`: added to M, A/m, (recordings,).
@@ -46,30 +45,8 @@ def _march(template, names, point, predictor):
 
 
 @kept
-def _march_changes(template, names, point, predictor, total, directions):
-    """What `_march` gives, and its change along each of the directions; the densities of these at a total mass of 1."""
-    marched, push = jax.linearize(lambda p: predictor.march(p.actuator(template, names), p.levels), point)
-
-    def scaled(d):
-        return d if d.masses is None else eqx.tree_at(lambda d: (d.masses, d.values), d, (total * d.masses, total * d.values))
-
-    return marched, pushed(lambda d: push(scaled(d)), directions)
-
-
-@kept
 def _read(template, names, parameters, predictor, marched):
     return predictor.lines(template.replace(dict(zip(names, parameters, strict=True))), marched)
-
-
-@kept
-def _read_changes(template, names, parameters, predictor, marched, directions, changes):
-    """Change of the lines along each of the directions of the parameters, with the changes of the march."""
-
-    def lines(parameters, marched):
-        return predictor.lines(template.replace(dict(zip(names, parameters, strict=True))), marched)
-
-    _, push = jax.linearize(lines, parameters, marched)
-    return pushed(lambda d: push(*d), (directions, changes))
 
 
 class Passes:
@@ -84,8 +61,6 @@ class Passes:
         self.march = _Template(marching(template), tuple(moving), layout)
         self.read = _Template(template, tuple(sorted((*free, *own))), layout)
         self.total, self.held = float(layout.total), None if layout.held is None else float(np.sum(layout.held))
-        planes = ((COLUMNS, size, size) for size in (layout.hats.size, layout.hats.size + 1))
-        self.none = (None, None) if self.held is not None else tuple(map(np.zeros, planes))
         self.target = Target(*(np.asarray(getattr(problem.target, f.name)) for f in dataclasses.fields(Target)))
         self.order = np.asarray(problem.predictors[0].index)
 
@@ -114,35 +89,47 @@ class Passes:
 
     def jacobian(self, z) -> np.ndarray:
         """The derivative of the whitened misfit, on the coarse grid."""
-        z, predictor = np.asarray(z, float), self.problem.predictors[0]
-        parts, point, total = list(predictor.batches()), self._point(z), np.asarray(self.total)
-        parameters, rows = self.read.at(z), []
-        for first in range(0, len(z), COLUMNS):
-            columns = range(first, min(first + COLUMNS, len(z)))
-            towards, own = self._directions(z, columns), self.read.slopes(z, columns)
-            found = []
-            for part, places in parts:
-                there, along = self._of(point, z, part, places), self._along(towards, part, places, columns)
-                marched, changes = _march_changes(self.march.actuator, self.march.names, there, part, total, along)
-                lines = _read_changes(self.read.actuator, self.read.names, parameters, part, marched, own, changes)
-                found.append(np.asarray(lines)[: len(columns), : len(places)])
-            rows.append(np.concatenate(found, axis=1)[:, self.order])
+        z, layout, rows = np.asarray(z, float), self.problem.layout, []
+        slopes, n = layout.parameters(z)[1], layout.density_unknowns
+        rest, total = float(self.problem.template.hysteresis.rest), float(layout.total)
+        for _, places, found in self.rows(z):
+            own = np.zeros((*found.mean.shape, len(z)))
+            if self.held is None:
+                own[..., :n] = total * found.by_density(self.problem.basis, rest)
+            own[..., n] = total * found.known[..., 0]
+            for part, by in ((self.march, found.by_drive_parameters()), (self.read, found.read)):
+                own[..., n + 1 + part.free] += by[..., part.to] * slopes[part.free]
+            for k, place in enumerate(places if layout.memories else ()):
+                own[k, :, len(z) - layout.memories + place] = MEMORY * total * found.known[k, :, 0]
+            rows.append(own)
+        lines = as_lines(np.moveaxis(np.concatenate(rows)[self.order], 2, 0))
         still = dataclasses.replace(self.target, lines=np.zeros_like(self.target.lines))
-        return whitened(np.concatenate(rows), still, np).T
+        return whitened(lines, still, np).T
+
+    def rows(self, z):
+        """What every line asks of its march and of what is read, on the coarse grid: yields (part of the predictor, places of
+        its recordings, `Rows`)."""
+        z, predictor = np.asarray(z, float), self.problem.predictors[0]
+        point = self._point(z)
+        for part, places in predictor.batches():
+            marched = marched_steps(self.march.actuator, self.march.names, self._of(point, z, part, places), part)
+            read = self.read_rows(z, part, (marched.field, marched.magnetization))
+            number = len(places)  # the last is repeated
+            yield part, places, rows_of(*(jax.tree.map(lambda x, n=number: np.asarray(x)[:n], k) for k in (marched, *read)))
+
+    def read_rows(self, z, part, marched):
+        """The lines of a part of the recordings by the signals behind the march, and by parameters there: see `adjoint.read_rows`."""
+        return read_rows(self.read.actuator, self.read.names, self.read.at(np.asarray(z, float)), part, marched)
 
     def compiling(self, z) -> list:
         """What a fit from z compiles, as calls that do not wait for each other."""
         z = np.asarray(z, float)
         part, places = next(self.problem.predictors[0].batches())
-        columns = range(min(COLUMNS, len(z)))
-        there = self._of(self._point(z), z, part, places)
-        along, own = self._along(self._directions(z, columns), part, places, columns), self.read.slopes(z, columns)
-        still = ((np.zeros(part.drives[0].shape),) * 2,)
-        none = jax.tree.map(lambda x: np.zeros((COLUMNS, *x.shape)), still)
+        there, still = self._of(self._point(z), z, part, places), np.zeros(part.drives[0].shape)
         return [
             lambda _: self.residual(z),
-            lambda _: _march_changes(self.march.actuator, self.march.names, there, part, np.asarray(self.total), along),
-            lambda _: _read_changes(self.read.actuator, self.read.names, self.read.at(z), part, still, own, none),
+            lambda _: marched_steps(self.march.actuator, self.march.names, there, part),
+            lambda _: self.read_rows(z, part, (still, still)),
         ]
 
     def _marched(self, z, predictor):
@@ -164,26 +151,6 @@ class Passes:
             levels[: len(places)] = MEMORY * self.total * z[len(z) - memories :][places]
         return dataclasses.replace(point, levels=levels)
 
-    def _directions(self, z, columns) -> Point:
-        """Of each of the unknowns `columns`, COLUMNS in all."""
-        layout, part, offset = self.problem.layout, columns[0] // COLUMNS, np.zeros(COLUMNS)
-        hats = self.held is None and part < len(self.problem.tables)
-        if hats:
-            offset += self.total * np.asarray(self.problem.tables[part])[:, -1, 0]
-        if layout.density_unknowns in columns:
-            offset[layout.density_unknowns - columns[0]] = self.total
-        masses, values = (layout.hats.each(columns[0]), self.problem.tables[part]) if hats else self.none
-        return Point(masses, values, offset, self.march.slopes(z, columns))
-
-    def _along(self, towards, part, places, columns) -> Point:
-        """The directions of a batch: with the levels of its recordings."""
-        memories, levels = self.problem.layout.memories, np.zeros((COLUMNS, len(part.index)))
-        if memories:
-            own = self.problem.layout.size - memories + places - columns[0]
-            here = np.flatnonzero((own >= 0) & (own < len(columns)))
-            levels[own[here], here] = MEMORY * self.total
-        return dataclasses.replace(towards, levels=levels)
-
 
 class _Template:
     """An actuator and the parameters of it that a program is given, SI: of all effects, free or not, and what else is free."""
@@ -199,11 +166,3 @@ class _Template:
         values = self.values.copy()
         values[self.to] = self.layout.parameters(z)[0][self.free]
         return values
-
-    def slopes(self, z, columns) -> np.ndarray:
-        """Their derivatives by the unknowns `columns`, (COLUMNS, parameters)."""
-        found = np.zeros((COLUMNS, len(self.names)))
-        rows = self.layout.density_unknowns + 1 + self.free - columns[0]
-        here = (rows >= 0) & (rows < len(columns))
-        found[rows[here], self.to[here]] = self.layout.parameters(z)[1][self.free][here]
-        return found

@@ -9,25 +9,14 @@ domain between the harmonics.
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from magjax.effects import CATALOGUE
 
-from .columns import (
-    bare,
-    drive_change,
-    in_step_change,
-    late_change,
-    lines_of,
-    marching,
-    signals_of,
-    through_march,
-    to_lines,
-    trajectory,
-)
+from .adjoint import as_lines
+from .columns import bare, drive_change, in_step_change, late_change, lines_of, marching, signals_of, trajectory
 from .joint import data_jacobian, data_residual
 from .model import whitened
 from .together import let_go
@@ -119,52 +108,55 @@ def applicable(actuator, quasistatic: bool = False):
 
 
 def _behind(classes, predictor, actuator, signals):
-    """(class, shapes) of all that act behind the hysteresis, and what they do there: per grid (free displacement, displacement, reading)."""
+    """(class, shapes) of all that act behind the hysteresis, and what they do there: (free displacement, displacement, reading)."""
     asked, rows = [], []
     for c in classes:
         if not c.in_step and c.block != "source":
             shapes = shape_grid(c)
             stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shapes))
             asked += [(c, s) for s in shapes]
-            rows.append(late_change(stacked, predictor, actuator, signals))
-    return asked, jax.tree.map(lambda *x: jnp.concatenate(x), *rows)
+            rows += late_change(stacked, predictor, actuator, signals)
+    return asked, [np.concatenate(x) for x in zip(*rows, strict=True)]
 
 
-def _before(classes, trials, predictor, own, path):
-    """(class, shapes) of all that act before the magnetostriction, and the change of (field, magnetization, current), per grid.
+def _before(classes, trials, predictor, own, path, rows):
+    """(class, shapes) of all that act before the magnetostriction, and the change of the lines, (columns, recordings, lines).
 
     `trials`: finite amplitudes of the classes that have no derivative at null; `own`: the actuator with the effects that march;
-    `path`: its trajectory."""
-    plain, asked, rows = bare(own), [], []
-    still = tuple(tuple(jnp.zeros_like(part[0]) for _ in range(3)) for part in path)
-    calm = tuple(jnp.zeros_like(d) for d in predictor.drives)
+    `path`: its trajectory; `rows`: what lines ask."""
+    plain, number, found = bare(own), len(rows.mean), {}
     for c in classes:
         if c.shells or not (c.in_step or c.block == "source"):
             continue
         for shapes in trials[c] or shape_grid(c):
-            asked.append((c, shapes))
             if c.in_step:
-                rows.append((in_step_change(c(**shapes), predictor, plain, path, c.amplitude in shapes), calm))
+                (change,) = in_step_change(c(**shapes), predictor, plain, path, c.amplitude in shapes)
+                found.setdefault(True, []).append(((c, shapes), [np.asarray(x)[:number] for x in change]))
             else:
-                rows.append((still, drive_change(c(**shapes), predictor, plain)))
-    return asked, through_march(predictor, own, *jax.tree.map(lambda *x: jnp.stack(x), *rows))
+                (change,) = drive_change(c(**shapes), predictor, plain)
+                found.setdefault(False, []).append(((c, shapes), np.asarray(change)[:number]))
+    lines = [rows.of_steps(*(np.stack(x) for x in zip(*(change for _, change in found[True]), strict=True)))] if True in found else []
+    lines += [rows.of_drive(np.stack([change for _, change in found[False]]))] if False in found else []
+    return [asked for kind in (True, False) for asked, _ in found.get(kind, ())], lines
 
 
-def _changes(classes, trials, predictor, actuator):
+def _changes(classes, trials, predictor, actuator, rows):
     """(class, shapes) of every effect, and the first-order change of the lines of the predictor's recordings, (columns, recordings,
     harmonics + 1)."""
-    own = marching(actuator)
+    own, number = marching(actuator), len(rows.mean)
     fields, path = trajectory(predictor, own)
     signals = signals_of(predictor, actuator, fields)
     behind, late = _behind(classes, predictor, bare(actuator), signals)
-    before, early = _before(classes, trials, predictor, own, path)
-    changes = jax.tree.map(lambda x: jnp.concatenate([jnp.zeros((len(behind), *x.shape[1:])), x]), early)
-    late = jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros((len(before), *x.shape[1:]))]), late)
-    asked, lines = behind + before, [np.asarray(to_lines(predictor, actuator, fields, changes, late))]
+    before, lines = _before(classes, trials, predictor, own, path, rows)
+    asked = before + behind
+    if behind:
+        lines.append(rows.of_signals(*(np.asarray(x)[:, :number] for x in late)))
+    lines = [as_lines(x) for x in lines]
     for c in classes:
         for shapes in trials[c] if c.shells else ():
             other, _ = trajectory(predictor, own.with_effect(c(**shapes)))
-            lines.append((lines_of(predictor, signals_of(predictor, actuator, other)) - lines_of(predictor, signals))[None])
+            change = lines_of(predictor, signals_of(predictor, actuator, other)) - lines_of(predictor, signals)
+            lines.append(change[None, :number])
             asked.append((c, shapes))
     return asked, np.concatenate(lines)
 
@@ -176,13 +168,12 @@ def columns(problem, z):
     classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
     drives = [np.asarray(d) for d in predictor.drives]
     trials, lines = {c: c.finite_trials(drives, predictor.steps) for c in classes}, []
-    for part, places in predictor.batches():
-        asked, found = _changes(classes, trials, part, actuator)
-        lines.append(found[:, : len(places)])
+    for part, _, rows in problem.passes.rows(z):
+        asked, found = _changes(classes, trials, part, actuator, rows)
+        lines.append(found)
     lines = np.concatenate(lines, axis=1)[:, np.asarray(predictor.index)]
-    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
-    whole = np.asarray(jax.vmap(whitened, (0, None))(lines, zero))
-    return [(c, s, column) for (c, s), column in zip(asked, whole, strict=True)]
+    still = dataclasses.replace(problem.passes.target, lines=np.zeros_like(problem.passes.target.lines))
+    return [(c, s, column) for (c, s), column in zip(asked, whitened(lines, still, np), strict=True)]
 
 
 class Projector:

@@ -18,27 +18,6 @@ TOUCHING = 0.03  # of the largest strain, below which it may be taken for none
 SIGNS = 50  # instants of a period at which the sign of M is sought
 
 
-def everett_rows(basis, alpha, beta) -> np.ndarray:
-    """T(alpha, beta) of every basis function at total mass 1, (points, unknowns)."""
-    L = basis.size
-    k = np.arange(L)
-    step = (basis.high - basis.low) / L
-
-    def locate(field):
-        place = np.clip((np.asarray(field) - basis.low) / step, 0, L)
-        cell = np.clip(np.floor(place), 0, L - 1).astype(int)
-        return cell, place - cell
-
-    (i, p), (j, q) = locate(alpha), locate(beta)
-
-    def rows(T):
-        corners = (1 - p) * ((1 - q) * T[:, i, j] + q * T[:, i, j + 1]) + p * ((1 - q) * T[:, i + 1, j] + q * T[:, i + 1, j + 1])
-        diagonal = T[:, k, k + 1]
-        return corners - p * (1 - p) * diagonal[:, i] - q * (1 - q) * diagonal[:, j]
-
-    return np.concatenate([rows(np.asarray(T)) for T in basis.tables])[: basis.unknowns].T
-
-
 def operator_rows(basis, field: np.ndarray, history=()) -> np.ndarray:
     """d M / d x at total mass 1 for a field sequence after negative saturation and a history: (time, unknowns).
 
@@ -62,7 +41,7 @@ def operator_rows(basis, field: np.ndarray, history=()) -> np.ndarray:
         samples.append(len(events) - 1)
         del rising
     alpha, beta, sign, parent = (np.asarray(c) for c in zip(*events, strict=True))
-    rows = sign[:, None] * everett_rows(basis, alpha, beta)
+    rows = sign[:, None] * basis.everett(alpha, beta)
     total = np.zeros_like(rows)
     for k in range(1, len(rows)):
         total[k] = total[parent[k]] + rows[k]

@@ -17,7 +17,7 @@ import magjax.bench
 from fitting import solver
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
-from fitting.density import COLUMNS, DensityBasis, cell_basis, everett_values, hat_basis
+from fitting.density import DensityBasis, cell_basis, everett_values, hat_basis
 from fitting.experiments import _predicted
 from fitting.finer import FINER, cells_beside, finer_hats, finer_than
 from fitting.fit import fit
@@ -294,8 +294,9 @@ def test_linear_rows_are_the_operator(make):
     masses = np.asarray(operator.masses)
     assert basis.hats.masses(x) == pytest.approx(masses) == np.asarray(basis.hats.masses(jnp.asarray(x)))
     assert everett_values(masses) == pytest.approx(np.asarray(operator.table().values))
-    every = np.concatenate([basis.hats.each(k) for k in range(0, basis.unknowns, COLUMNS)])
-    assert np.tensordot(x, every[: basis.unknowns], 1) == pytest.approx(masses) and not every[basis.unknowns :].any()
+    assert np.tensordot(x, basis.hats.each(0, basis.unknowns), 1) == pytest.approx(masses)
+    assert np.array_equal(basis.hats.each(3, 2), basis.hats.each(0, basis.unknowns)[3:5])
+    assert basis.values @ x == pytest.approx(np.asarray(operator.table().values).ravel())
 
 
 def test_cells_of_many_are_the_same_density():

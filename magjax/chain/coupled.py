@@ -132,6 +132,12 @@ def _law(actuator, h, scheme, period) -> _Law:
 def _at_rest(law: _Law, table, actuator, applied, current, h, memory: Memory):
     """The state at the first sample, at equilibrium, and the row (H, M, relay field, residual) there."""
     memory = apply_field(table, memory, applied)
+    carry, M = _rested(law, actuator, applied, current, h, memory)
+    return carry, (carry.H0, M, memory.field, jnp.zeros_like(memory.field))
+
+
+def _rested(law: _Law, actuator, applied, current, h, memory: Memory):
+    """The state at the first sample, the relays' field and M those of the memory, and M with what effects add."""
     zero = jnp.zeros_like(memory.field)
     rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
     states = tuple(e.start(rest, actuator) for e in law.effects)
@@ -139,7 +145,7 @@ def _at_rest(law: _Law, table, actuator, applied, current, h, memory: Memory):
     H, M = memory.field + shift, memory.magnetization + added
     X = H + memory.magnetization + added
     before = (memory.field, memory.magnetization) if law.effects else ()
-    return _Carry(memory, X, X, H, applied, states, states, before), (H, M, memory.field, zero)
+    return _Carry(memory, X, X, H, applied, states, states, before), M
 
 
 def run_march(march: March, applied, current, disturbance=None, period: int = 0):

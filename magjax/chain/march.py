@@ -11,11 +11,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.lax import stop_gradient
 
-from ..preisach.memory import Memory, branch_magnetization
+from ..preisach.memory import Memory, apply_field, branch_magnetization
 from .closed_form import pushed, unmoved
-from .coupled import _at_rest, _ends_of_periods, _law, march_of, run_march
+from .coupled import _at_rest, _ends_of_periods, _law, _rested, march_of, run_march
 from .newton import stop_gradient_trial
 
 
@@ -102,34 +104,174 @@ def _replay(scheme, period, fields, actuator, applied, current, h, memory, distu
     table = actuator.hysteresis.table()
     carry, first = _at_rest(law, table, actuator, applied[0], current[0], h, memory)
     places = _places(table, carry.memory, count)
-    known = places.shape[0] - count
-    frozen, v = stop_gradient(table), fields[1:]
-    rising, place, threshold = stop_gradient(_branches(frozen, stop_gradient(carry.memory), fields))
-    moved = jax.linearize(lambda x, y: branch_magnetization(frozen, rising, x, 0.0, y), threshold, v)[1]
-    rise, along = moved(jnp.ones_like(v), jnp.zeros_like(v)), moved(jnp.zeros_like(v), jnp.ones_like(v))
-    base = branch_magnetization(table, rising, threshold, 0.0, v) - rise * threshold
+    known = _known(table, carry.memory, fields)
     carry = eqx.tree_at(lambda c: c.memory, carry, _Trace(carry.memory.field, places))
 
     def advance(c, now):
-        drive, number, v, place, base, rise, along = now
-        rhs, trial_at = law.posed(c, drive)
-        corner = jax.lax.optimization_barrier(c.memory.places.at[place].get(mode="promise_in_bounds"))
-        m = corner[1] + base + rise * corner[0]
-        slope, extra = law.p + law.q * along, 0.0
-        if law.effects:
-            extra = law.extra(c.states, trial_at(v, m))[0]
-
-            def other(x):
-                return law.extra(stop_gradient(c.states), stop_gradient_trial(trial_at, x, stop_gradient(m) + along * (x - v)))[0]
-
-            slope = slope + jax.jvp(other, (v,), (jnp.ones_like(v),))[1]
-        change = -(law.p * v + law.q * m - rhs + extra) / stop_gradient(slope)
-        v, m = v + change, m + along * change
-        extra = law.extra(c.states, trial_at(v, m)) if law.effects else (0.0, 0.0, 0.0)
+        drive, number, branch = now
+        corner = jax.lax.optimization_barrier(c.memory.places.at[branch.place].get(mode="promise_in_bounds"))
+        v, m, after = _again(law, c, drive, branch, corner)
         places = c.memory.places.at[number].add(jnp.stack([v, m]), mode="promise_in_bounds", unique_indices=True)
-        return law.after(c, drive, trial_at, v, m, extra, _Trace(v, places), law.p * v + law.q * m + extra[0] - rhs)
+        return after(_Trace(v, places))
 
     drive = (applied[1:], current[1:], _ends_of_periods(count, period), *(d[1:] for d in disturbance or ()))
-    numbers = known + jnp.arange(1, count)
-    rows = jax.lax.scan(advance, carry, (drive, numbers, v, place, base, rise, along))[1]
+    numbers = places.shape[0] - count + jnp.arange(1, count)
+    rows = jax.lax.scan(advance, carry, (drive, numbers, known))[1]
     return tuple(jnp.concatenate([x[None], y]) for x, y in zip(first, rows, strict=True))
+
+
+class _Known(NamedTuple):
+    """The branch of every step after the first, (steps,) each: the field where it ended, whether it rises, the place of its
+    corner as in `_places`, the threshold there; M above the corner's is `base` + `rise` times the corner's field, and rises
+    by `along` with the field."""
+
+    field: jax.Array
+    rising: jax.Array
+    place: jax.Array
+    threshold: jax.Array
+    base: jax.Array
+    rise: jax.Array
+    along: jax.Array
+
+
+def _known(table, memory: Memory, fields) -> _Known:
+    """The branches of a march through these relay fields; derivatives of the table go into `base`."""
+    frozen, v = stop_gradient(table), fields[1:]
+    rising, place, threshold = stop_gradient(_branches(frozen, stop_gradient(memory), fields))
+    moved = jax.linearize(lambda x, y: branch_magnetization(frozen, rising, x, 0.0, y), threshold, v)[1]
+    rise, along = moved(jnp.ones_like(v), jnp.zeros_like(v)), moved(jnp.zeros_like(v), jnp.ones_like(v))
+    base = branch_magnetization(table, rising, threshold, 0.0, v) - rise * threshold
+    return _Known(v, rising, place, threshold, base, rise, along)
+
+
+def _again(law, c, drive, branch: _Known, corner):
+    """A step on its known branch from its corner, (field, M): its end (v, m), and how to go on with a memory, (carry, row)."""
+    rhs, trial_at = law.posed(c, drive)
+    v, along = branch.field, branch.along
+    m = corner[1] + branch.base + branch.rise * corner[0]
+    slope, extra = law.p + law.q * along, 0.0
+    if law.effects:
+        extra = law.extra(c.states, trial_at(v, m))[0]
+
+        def other(x):
+            return law.extra(stop_gradient(c.states), stop_gradient_trial(trial_at, x, stop_gradient(m) + along * (x - v)))[0]
+
+        slope = slope + jax.jvp(other, (v,), (jnp.ones_like(v),))[1]
+    change = -(law.p * v + law.q * m - rhs + extra) / stop_gradient(slope)
+    v, m = v + change, m + along * change
+    extra = law.extra(c.states, trial_at(v, m)) if law.effects else (0.0, 0.0, 0.0)
+
+    def after(memory):
+        return law.after(c, drive, trial_at, v, m, extra, memory, law.p * v + law.q * m + extra[0] - rhs)
+
+    return v, m, after
+
+
+class Steps(eqx.Module):
+    """A march to first order, step by step, of a rod in one or more shells. A state of d numbers goes from step to step; (field, M) of a
+    shell after a step are a place from which later branches leave, numbered as in `_places`, `before` of them older than the first step.
+
+    `slopes`: (steps, d + 2 shells + 2, d + 3 shells + 5 + parameters), of (state after, relay fields, M of the relays, field H, magnetization)
+    by (state before, fields and M of the corners, what is added to M of the relays, applied field, current, and the three of a
+    disturbance, see `magnetize`, parameters). `place`: (steps, shells), of the corner; `rising`, `threshold`, A/m: of the branch.
+    `rest`: (d, shells + 2 + parameters), of the first state by (M of the relays, applied field, current, parameters).
+    `corners`: (2, corners), fields of maxima and minima before the first step; `moved`: (before, 2), of the older places by the applied field
+    of the first sample. `field`, `magnetization`: H and M, (steps + 1,), `relay_field`: (steps + 1, shells), A/m.
+    """
+
+    slopes: jax.Array
+    place: jax.Array
+    rising: jax.Array
+    threshold: jax.Array
+    rest: jax.Array
+    corners: jax.Array
+    moved: jax.Array
+    field: jax.Array
+    magnetization: jax.Array
+    relay_field: jax.Array
+
+
+DISTURBED = 3  # numbers of a disturbance
+
+
+def linearized(made, parameters, applied, current, h, corners: int, scheme: str, period: int) -> Steps:
+    """The steps of a march; `made(parameters)`: the actuator, `parameters`: (parameters,); the rest as in `magnetize`.
+
+    Its derivatives by the drive, the density, the parameters and what effects add are products of these few numbers.
+    """
+    actuator = made(parameters)
+    table = actuator.hysteresis.table()
+    start = actuator.hysteresis.memory(table, corners)
+    memory = apply_field(table, start, applied[0])
+    march = march_of(actuator, applied[0], current[0], h, start, scheme, period)
+    shells = sum(e.shells for e in actuator.effects) or 1
+    rest, shaped = _flat(march.carry)
+
+    def advance(carry, drive):
+        then, row = march.advance(carry, drive)
+        return then, (_flat(carry)[0], *jnp.reshape(jnp.stack([then.memory.field, then.memory.magnetization]), (2, shells)), *row[:2])
+
+    ends = _ends_of_periods(len(applied), period)
+    flat, *rows = jax.lax.scan(advance, march.carry, (applied[1:], current[1:], ends))[1]
+    first = (x * jnp.ones(shells) for x in (memory.field, memory.magnetization))
+    v, m, H, M = (jnp.concatenate([x[None], y]) for x, y in zip((*first, *(x.mean() for x in march.first[:2])), rows, strict=True))
+    known = jax.vmap(lambda v: _known(table, memory, v), 1, 1)(v)
+    older = jnp.broadcast_to(_places(table, memory, 1)[:, :, None], (2 * memory.corners + 2, 2, shells))
+    places = jnp.concatenate([older, jnp.stack([v[1:], m[1:]], axis=1)])
+    corner = jnp.take_along_axis(places, known.place[:, None], axis=0)
+    cuts = np.cumsum([len(rest), shells, shells, shells, 2, DISTURBED])
+
+    def one(given, end, branch):
+        flat, x, m, added, drive, disturbance, parameters = jnp.split(given, cuts)
+        branch = branch._replace(base=branch.base + added)
+        again = _stepping(made(parameters), h, scheme, period)[1]
+        v, m, after = again(shaped(flat), (*drive, end, *disturbance), branch, (x, m))
+        then, (H, M, *_) = after(_Trace(jnp.reshape(v, march.carry.memory.field.shape), None))
+        return jnp.concatenate([_flat(then)[0], jnp.ravel(v), jnp.ravel(m), jnp.stack([H, M])])
+
+    still = jnp.broadcast_to(jnp.concatenate([jnp.zeros(DISTURBED), parameters]), (len(v) - 1, DISTURBED + len(parameters)))
+    given = [flat, corner[:, 0], corner[:, 1], jnp.zeros_like(v[1:]), applied[1:, None], current[1:, None], still]
+    slopes = jax.vmap(jax.jacfwd(one))(jnp.concatenate(given, axis=1), ends, known)
+
+    def rested(given):
+        m, (applied, current), parameters = given[:shells], given[shells : shells + 2], given[shells + 2 :]
+        at = _Rest(applied * jnp.ones_like(march.carry.memory.field), jnp.reshape(m, march.carry.memory.field.shape))
+        return _flat(_stepping(made(parameters), h, scheme, period)[0](applied, current, at))[0]
+
+    begin = jnp.concatenate([m[0], applied[:1], current[:1], parameters])
+    moved = jax.jacfwd(lambda x: _places(table, apply_field(table, start, x), 1))(applied[0])
+    ends_of_memory = jnp.stack([memory.maxima, memory.minima])
+    return Steps(slopes, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, v)
+
+
+class _Rest(NamedTuple):
+    """Stands for the memory at the first sample."""
+
+    field: jax.Array
+    magnetization: jax.Array
+
+
+def _flat(carry):
+    """A carry in one row, of its memory the field alone, and how to shape it again."""
+    less = {"before": ()} if hasattr(carry, "before") else {}
+    return ravel_pytree(dataclasses.replace(carry, memory=_Trace(carry.memory.field, None), **less))
+
+
+def _stepping(actuator, h, scheme, period):
+    """The state at rest, of (applied, current, memory), and a step on known branches, of (carry, drive, branch, corner), of an actuator; fields and M
+    of the shells have an axis."""
+    cut = next((e for e in actuator.effects if e.shells), None)
+    if cut is not None:
+        from .shells import _rod, again_in_shells, rested_shells  # which is built on this module
+
+        rod = _rod(actuator, cut.share(), cut.shells, h, scheme, period)
+        return (
+            lambda applied, current, memory: rested_shells(rod, actuator, applied, current, h, memory)[0],
+            lambda *given: again_in_shells(rod, actuator, *given),
+        )
+    law = _law(actuator, h, scheme, period)
+
+    def again(c, drive, branch, corner):
+        return _again(law, c, drive, jax.tree.map(lambda x: x[0], branch), (corner[0][0], corner[1][0]))
+
+    return lambda applied, current, memory: _rested(law, actuator, applied, current, h, memory)[0], again

@@ -10,6 +10,8 @@ steps; one more step with a frozen matrix makes every derivative exact, as in `c
 Means over the shells go to the blocks behind: what the coil sees and what the rod does as a whole.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -66,50 +68,98 @@ def march_shells(actuator, share, count: int, applied, current, h, memory, schem
 def march_of_shells(actuator, share, count: int, applied, current, h, memory, scheme: str, period: int = 0) -> March:
     """`coupled.march_of` for such a rod."""
     table = actuator.hysteresis.table()
+    rod = _rod(actuator, share, count, h, scheme, period)
+    memory = jax.vmap(lambda _: apply_field(table, memory, applied))(jnp.arange(count))
+    carry, M = rested_shells(rod, actuator, applied, current, h, memory)
+
+    def advance(c: _Carry, drive):
+        rhs, trial_of = rod.posed(c, drive)
+        v, m, rising, kept = _solve(table, c, rod.effects, actuator, trial_of, drive[1], rod.p0, rod.Q, rhs)
+        moved = jax.vmap(lambda s, r, k, x, y: s.move(r, k, x, y))(c.memory, rising, kept, v, m)
+        unlike = _relays(table, c.memory, v)[0] - m  # the relays' own M there: a step that did not settle shows
+        return rod.after(c, drive, v, m, moved, unlike)
+
+    return March(carry, (carry.H0, M, memory.field, jnp.zeros_like(memory.field)), advance)
+
+
+class _Rod(NamedTuple):
+    """One step of a rod in shells apart from how it is solved, as `coupled._Law`: p0 (v + shift) + loss + Q X = rhs.
+
+    `posed(carry, drive)`: (rhs, trial of (carry, current, v, m)); `after(carry, drive, v, m, memory, unlike)`: (next carry, row).
+    """
+
+    effects: tuple
+    p0: float
+    Q: jax.Array
+    posed: object
+    after: object
+
+
+def _rod(actuator, share, count, h, scheme, period) -> _Rod:
     effects = tuple(e for e in actuator.effects if e.in_step and not e.shells)
     bdf = scheme == "bdf2"
     a = MU0 * actuator.coil.loss / h
     D = (1 + share * (distribution(count) - 1)) / count
     p0, Q = (1.0, 1.5 * a * D) if bdf else (0.5, a * D)
 
-    memory = jax.vmap(lambda _: apply_field(table, memory, applied))(jnp.arange(count))
-    zero = jnp.zeros_like(memory.field)
-    rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
-    states = _of_every_shell(tuple(e.start(rest, actuator) for e in effects), count)
-    _, shift, added = extra_terms(effects, states, actuator, rest, 0.0, 0.0)
-    first = memory.field + shift
-    X = first + memory.magnetization + added
-    carry = _Carry(memory, X, X, first, applied, states, states)
+    def trial_of(c, current, v, m):
+        X1 = v + m
+        change = (1.5 * X1 - 2 * c.X0 + 0.5 * c.X_before) if bdf else X1 - c.X0
+        return Trial(v, m, MU0 * change / h, (v - c.memory.field) / h, current, h)
 
-    def advance(c: _Carry, drive):
-        applied1, current1, end, *given = drive
+    def posed(c, drive):
+        applied1, _, _, *given = drive
         if bdf:
             rhs = applied1 + (Q / 1.5) @ (2 * c.X0 - 0.5 * c.X_before)
         else:
             rhs = 0.5 * (applied1 + c.applied0 - c.H0) + Q @ c.X0
         if given:  # p = p0 + q there: what is added to H acts on the loss too
             rhs = rhs - p0 * given[0] - Q @ (jnp.ones(count) * (given[0] + given[1])) - given[2]
+        return rhs, trial_of
 
-        def trial_of(c, current, v, m):
-            X1 = v + m
-            change = (1.5 * X1 - 2 * c.X0 + 0.5 * c.X_before) if bdf else X1 - c.X0
-            return Trial(v, m, MU0 * change / h, (v - c.memory.field) / h, current, h)
-
-        v, m, rising, kept = _solve(table, c, effects, actuator, trial_of, current1, p0, Q, rhs)
+    def after(c, drive, v, m, memory, unlike):
+        applied1, current1, end, *given = drive
+        rhs, _ = posed(c, drive)
         trial = trial_of(c, current1, v, m)
         loss, shift, added = extra_terms(effects, c.states, actuator, trial, 0.0, 0.0)
         H, M = v + shift, m + added
-        residual = p0 * H + loss + Q @ (H + M) - rhs
-        residual = residual + (_relays(table, c.memory, v)[0] - m)  # the relays' own M there: a step that did not settle shows
-        moved = jax.vmap(lambda s, r, k, x, y: s.move(r, k, x, y))(c.memory, rising, kept, v, m)
+        residual = p0 * H + loss + Q @ (H + M) - rhs + unlike
         states = _of_every_shell(tuple(e.advance(trial, s, actuator) for e, s in zip(effects, c.states, strict=True)), count)
         states, marks = _settle(effects, states, c.marks, end, period * h)
         if given:
             H, M = H + given[0], M + given[1]
         row = (H.mean(), M.mean(), v.mean(), residual[jnp.argmax(jnp.abs(residual))])
-        return _Carry(moved, H + M, c.X0, H, applied1, states, marks), row
+        return _Carry(memory, H + M, c.X0, H, applied1, states, marks), row
 
-    return March(carry, (first, rest.magnetization + added, rest.field, zero), advance)
+    return _Rod(effects, p0, Q, posed, after)
+
+
+def rested_shells(rod: _Rod, actuator, applied, current, h, memory):
+    """The state of a rod at the first sample, and M with what effects add, of every shell."""
+    count = memory.field.shape[0]
+    zero = jnp.zeros_like(memory.field)
+    rest = Trial(memory.field, memory.magnetization, zero, zero, current, h)
+    states = _of_every_shell(tuple(e.start(rest, actuator) for e in rod.effects), count)
+    _, shift, added = extra_terms(rod.effects, states, actuator, rest, 0.0, 0.0)
+    first = memory.field + shift
+    X = first + memory.magnetization + added
+    return _Carry(memory, X, X, first, applied, states, states), memory.magnetization + added
+
+
+def again_in_shells(rod: _Rod, actuator, c, drive, branch, corner):
+    """A step of all shells on their known branches, as `march._again`: one Newton step with a frozen matrix."""
+    rhs, trial_of = rod.posed(c, drive)
+    v, along = branch.field, branch.along
+    m = corner[1] + branch.base + branch.rise * corner[0]
+
+    def terms(v, m):
+        return extra_terms(rod.effects, c.states, actuator, trial_of(c, drive[1], v, m), 0.0, 0.0)
+
+    (loss, shift, added), (d_loss, d_shift, d_added) = jax.jvp(terms, (v, m), (jnp.ones_like(v), along))
+    matrix = jnp.diag(rod.p0 * (1 + d_shift) + d_loss) + rod.Q * (1 + d_shift + along + d_added)
+    change = -inverse_of(stop_gradient(matrix)) @ (rod.p0 * (v + shift) + loss + rod.Q @ (v + shift + m + added) - rhs)
+    v, m = v + change, m + along * change
+    return v, m, lambda memory: rod.after(c, drive, v, m, memory, 0.0)
 
 
 def _of_every_shell(states, count):

@@ -225,6 +225,37 @@ print(json.dumps(found))
 """
 
 
+def jacobian():
+    """The Jacobian of nine loops by the lines of the reading, over the same by unknowns pushed through the chain a hundred at a time."""
+    from fitting.joint import data_jacobian
+    from fitting.model import whitened
+    from fitting.setup import Choices, build_problem, free_parameters, spectra_of
+    from tests.studies.joint_fit import SINES, one_draw, settled
+
+    bench, found = load_bench("aa-050h"), {}
+    actuator, spectra = bench.actuator(), spectra_of(one_draw(settled("gauss"), 0)[0][: len(SINES)], bench)
+    for knots in ((18, 13), (48, 32)):
+        problem, z = build_problem(spectra, actuator, bench, free_parameters(bench, actuator), Choices(knots=knots, rest="negative"))
+        layout, coarse, width = problem.layout, problem.predictors[0], 100
+
+        def residual(y, layout=layout, coarse=coarse, problem=problem):
+            return whitened(coarse(layout.actuator(problem.template, y), layout.levels(y)), problem.target)
+
+        def pushed(z, directions, residual=residual):
+            return jax.lax.map(jax.vmap(jax.linearize(residual, z)[1]), directions)
+
+        count = -(-len(z) // width) * width
+        directions, run = jnp.eye(count, len(z)).reshape(-1, width, len(z)), jax.jit(pushed)
+        whole = np.asarray(run(jnp.asarray(z), directions)).reshape(count, -1)[: len(z)].T
+        rows = data_jacobian(problem, z)
+        assert np.abs(rows - whole).max() < 1e-9 * np.abs(whole).max()
+        columns = best(lambda run=run, z=z, directions=directions: run(jnp.asarray(z), directions), 3)
+        ours = best(lambda problem=problem, z=z: data_jacobian(problem, z), 3)
+        found[f"{len(z)} unknowns, over pushed columns (bar < 1)"] = ours / columns
+        found[f"{len(z)} unknowns, ms"] = 1e3 * ours
+    return found
+
+
 def compiler():
     """A residual and its Jacobian traced and compiled as `magjax.programs.COMPILER` asks, over the same as the compiler does by itself."""
     rows = {}
@@ -310,6 +341,7 @@ GROUPS = {
     "inversion": inversion,
     "l1": l1,
     "fit": joint_fit,
+    "jacobian": jacobian,
     "compiler": compiler,
 }
 
