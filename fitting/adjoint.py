@@ -27,8 +27,8 @@ class Marched(eqx.Module):
     """Marches to first order, of all recordings of a predictor with one grid: (recordings, ...) each.
 
     `field`, `magnetization`: (samples,), A/m, of the last period; `drive`: (2, samples, parameters), of applied field and current by
-    the parameters; `gain`: of the applied field by the current; `unreached`: (2,), of M by the highest and the lowest relay field
-    of the last period.
+    the parameters, the last of which is the sum of the masses, relative, as effects read it; `gain`: of the applied field by the
+    current; `unreached`: (2,), of M by the highest and the lowest relay field of the last period.
     """
 
     steps: Steps
@@ -46,8 +46,10 @@ def marched_steps(template, names, point, predictor) -> Marched:
     def one(drive, dt, level):
         line, count = Timeline(dt, drive.shape[0], True), drive.shape[0]
 
-        def made(parameters):
-            own = dataclasses.replace(point, offset=point.offset + level, parameters=parameters, levels=None)
+        def made(given):
+            # the last: of the masses, whose sum some effects read; the table stays
+            masses = None if point.masses is None else given[-1] * point.masses
+            own = dataclasses.replace(point, masses=masses, offset=point.offset + level, parameters=given[:-1], levels=None)
             return own.actuator(template, names)
 
         def driven(parameters):
@@ -55,14 +57,15 @@ def marched_steps(template, names, point, predictor) -> Marched:
             current = driven_current(actuator, drive, line)
             return jnp.stack([actuator.coil.applied_field(current), current])
 
-        actuator, (applied, current) = made(point.parameters), driven(point.parameters)
+        parameters = jnp.append(point.parameters, 1.0)
+        actuator, (applied, current) = made(parameters), driven(parameters)
         whole = (jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (applied, current))
-        steps = linearized(made, point.parameters, *whole, dt, predictor.corners, actuator.coil.scheme, count)
+        steps = linearized(made, parameters, *whole, dt, predictor.corners, actuator.coil.scheme, count)
         relay = steps.relay_field[-count:].mean(axis=1)
         ends = jnp.max(relay), jnp.min(relay)
         H, M = (x[-count - 1 : -1] for x in (steps.field, steps.magnetization))
         return Marched(
-            steps, H, M + actuator.hysteresis.unreached(*ends), jax.jacfwd(driven)(point.parameters),
+            steps, H, M + actuator.hysteresis.unreached(*ends), jax.jacfwd(driven)(parameters),
             jax.jacfwd(actuator.coil.applied_field)(current[0]), jnp.stack(jax.jacfwd(actuator.hysteresis.unreached, (0, 1))(*ends)),
         )  # fmt: skip
 
@@ -119,7 +122,7 @@ def read_rows(template, names, parameters, predictor, marched):
 class Rows:
     """What every line of some recordings, (recordings, lines) of each array, asks of their marches and of what is read.
 
-    `marched`: of the same recordings, in NumPy; `signals`: (6, samples), see `SIGNALS`; `read`: (parameters,), of those behind the
+    `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (6, samples), see `SIGNALS`; `read`: (parameters,), of those behind the
     march; `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom of
     the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`: (samples, 2), of applied field and
     current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see `magnetize`; `moving`:
@@ -151,8 +154,9 @@ class Rows:
             found.append((asked * sign) @ basis.everett(alpha, beta) + self.mean[r][:, None] * never)
         return np.stack(found)
 
-    def by_drive_parameters(self) -> np.ndarray:
-        """The lines by the parameters of the march and of what is before it, (recordings, lines, parameters)."""
+    def by_moving(self) -> np.ndarray:
+        """The lines by the parameters of the march and of what is before it, (recordings, lines, parameters), the last of them the
+        sum of the masses as effects read it."""
         return self.moving + np.einsum("rlnk,rknp->rlp", self.drive, self.marched.drive, optimize=True)
 
     def of_steps(self, *added) -> np.ndarray:
@@ -183,7 +187,7 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     steps, (number, lines, _, samples) = marched.steps, signals.shape
     (count, shells), size, older = steps.place.shape[1:], steps.rest.shape[1], steps.moved.shape[1]
     every = np.arange(number)
-    slopes = np.ascontiguousarray(np.moveaxis(steps.slopes, 0, 1).swapaxes(2, 3))  # (steps, recordings, in, out)
+    slopes = steps.slopes.swapaxes(2, 3)  # (recordings, steps, in, out)
     cuts = np.cumsum([0, size, 2 * shells, shells + 2 + DISTURBED, slopes.shape[2] - size - 3 * shells - 2 - DISTURBED])
     state, corners, added, moving = (slice(*ends) for ends in itertools.pairwise(cuts))
     at = np.zeros((older + count, number, 2, shells, lines))  # field and M of every place
@@ -198,7 +202,7 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     for t in range(count - 1, -1, -1):
         out[:, size:-2] = at[older + t].reshape(number, 2 * shells, lines)
         out[:, -2:] = asked[t]
-        np.matmul(slopes[t], out, out=back)
+        np.matmul(slopes[:, t], out, out=back)
         out[:, :size], kept[t] = back[:, state], back[:, added]
         left = back[:, corners].reshape(number, 2, shells, lines)
         for s in range(shells):
@@ -221,4 +225,5 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     drive[:, :, 0] += kept[:, :, -1, shells : shells + 2]
     own, disturbed = kept[..., :shells], kept[..., shells + 2 :]
     moving = (parameters + first[:, shells + 2 :]).swapaxes(1, 2)
+    marched = dataclasses.replace(marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
     return Rows(marched, signals, read, own, known[..., : older - 1], drive, disturbed, moving, mean)

@@ -108,7 +108,7 @@ class DensityBasis:
 
         def locate(field):
             place = np.clip((np.asarray(field) - self.low) / step, 0, L)
-            cell = np.clip(np.floor(place), 0, L - 1).astype(np.int64)
+            cell = np.clip(np.floor(np.nan_to_num(place)), 0, L - 1).astype(np.int64)  # of NaN any: its share is NaN
             return cell, place - cell
 
         (i, p), (j, q), width = locate(alpha), locate(beta), L + 1

@@ -92,12 +92,15 @@ class Passes:
         z, layout, rows = np.asarray(z, float), self.problem.layout, []
         slopes, n = layout.parameters(z)[1], layout.density_unknowns
         rest, total = float(self.problem.template.hysteresis.rest), float(layout.total)
+        gained = self.problem.basis.cells.sum(axis=0)  # by each hat, of the sum of the masses, of which it is a share
+        gained = gained / max(float(gained @ z[:n]), 1e-300) if self.held is None else None
         for _, places, found in self.rows(z):
             own = np.zeros((*found.mean.shape, len(z)))
+            moving = found.by_moving()
             if self.held is None:
-                own[..., :n] = total * found.by_density(self.problem.basis, rest)
+                own[..., :n] = total * found.by_density(self.problem.basis, rest) + moving[..., -1:] * gained
             own[..., n] = total * found.known[..., 0]
-            for part, by in ((self.march, found.by_drive_parameters()), (self.read, found.read)):
+            for part, by in ((self.march, moving), (self.read, found.read)):
                 own[..., n + 1 + part.free] += by[..., part.to] * slopes[part.free]
             for k, place in enumerate(places if layout.memories else ()):
                 own[k, :, len(z) - layout.memories + place] = MEMORY * total * found.known[k, :, 0]

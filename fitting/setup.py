@@ -117,6 +117,8 @@ def with_held_masses(choices: Choices, bench, actuator) -> Choices:
 def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
     """The problem and its starting vector. `start`: density unknowns and bottom to go on from, left aside where there are not as
     many; else equation error."""
+    if choices.periods < 2:
+        raise ConfigurationError(f"periods = {choices.periods}: a steady state takes two at least, of which the last is read")
     low, high = applied_range(spectra, actuator)
     margin = PLANE_MARGIN * (high - low)
     held = masses_held(bench)

@@ -79,11 +79,11 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         first = first_alone(evidence)
         return verdict(first) if first is not None else _unknown(evidence, common)
     worse = after > WORSE[0] * before + WORSE[1] * len(rows)
-    if steps and worse and not as_expected(evidence):  # a repair that foretells worse is not physics
-        return _unknown(evidence, common, " The repair that fits best predicts the check recordings worse, so it is not named.")
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
-    if steps and far_off and after > NO_BETTER[2] * before:
-        return _unknown(evidence, common, " The repair that fits best predicts the check recordings hardly better, so it is not named.")
+    hardly = far_off and after > NO_BETTER[2] * before
+    if steps and (worse or hardly) and not as_expected(evidence):  # a repair that foretells no better is not physics
+        how = "worse" if worse else "hardly better"
+        return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
         evidence = dataclasses.replace(evidence, reached=unconfirmed(evidence.reached))
     effects, groups, sizes, rivals = found_rows(evidence)

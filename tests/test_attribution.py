@@ -430,6 +430,17 @@ def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, 
     """One of two check recordings may get better and the other far worse: together they are worse."""
     assert fitting.verdict.verdict(evidence_of(monkeypatch, chi2n, before, after)).verdict == word
 
+
+@pytest.mark.parametrize(("expected", "word"), [(True, "attributed"), (False, "unknown_at")])
+@pytest.mark.parametrize("after", [(1.4, 9.0), (1.05, 7.6)], ids=["worse", "hardly better"])
+def test_what_errs_as_it_expects_is_named_all_the_same(monkeypatch, expected, word, after):
+    """A delta_e and a delay (81.7 to 0.93) missed a check recording by 72 of its noise for 76, in cells that no recording had switched:
+    in units of what they expect their misfit is 2.1, that of the plain fit 167."""
+    evidence = evidence_of(monkeypatch, 1.0, (1.4, 8.0), after)
+    monkeypatch.setattr(fitting.verdict, "as_expected", lambda e: expected)
+    assert fitting.verdict.verdict(evidence).verdict == word
+
+
 @pytest.mark.parametrize(("after", "offered"), [((1.05, 3.0), False), ((5.0, 4.0), True)], ids=["worse", "better"])
 def test_an_unknown_offers_no_repair_that_foretells_worse(monkeypatch, after, offered):
     """A clipping amplifier in place of one with a dead zone missed a check recording by 8 um, where the plain model missed 0.2."""

@@ -695,3 +695,8 @@ def test_a_fast_loop_passes_zero_where_slower_ones_do():
     assert agreeing([wide, narrow, wide, wide], [True, False, False, True]) == [0, 1, 3]  # the third must turn as the first does
     assert agreeing([wide, narrow], [False, True]) == [0]  # inside a loop that does not turn none does
     assert agreeing([narrow, wide], [False, True]) == [0, 1] and agreeing([narrow, wide], [True, False]) == [0]
+
+
+def test_one_period_is_no_steady_state():
+    with pytest.raises(ConfigurationError, match="periods = 1: a steady state takes two"):
+        build_problem((), None, None, (), Choices(periods=1))

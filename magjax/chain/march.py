@@ -1,8 +1,8 @@
 """The whole march of (4), and its derivatives.
 
 A derivative does not go through the march: once that has run it is known which corner of the memory each step left from
-and where it ended, and the same steps are taken again on those branches alone, with no memory to carry. A fit's
-derivatives, hundreds of directions at once, take a fifth of the time.
+and where it ended, and the same steps are taken again on those branches alone, with no memory to carry (`_replay`). A fit
+asks for the small derivatives of every step instead (`linearized`), and leads what it reads back through them.
 """
 
 import dataclasses
