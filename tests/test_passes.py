@@ -71,18 +71,8 @@ def test_they_are_those_of_the_whole_chain(rest):
         assert len(drive) == len(H) == len(M) and drive == pytest.approx(s.drive_at(np.arange(len(drive)) / len(drive)))
 
 
-@pytest.mark.parametrize("beside", [(), pytest.param((effects.MagneticAftereffect(share=0.02),), marks=pytest.mark.long)], ids=len)
-def test_so_they_are_of_a_rod_in_shells(beside):
-    """Along some directions of all unknowns."""
-    along_some_directions(effects.FieldDiffusion(kappa=0.7), *beside)
-
-
-def test_so_they_are_where_an_effect_reads_the_masses():
-    """The slope of the switching is that of all masses over the plane."""
-    along_some_directions(effects.RateDependentSwitching(gamma=200.0, of_flux=0.9))
-
-
 def along_some_directions(*held):
+    """The change of the misfit along some directions of all unknowns, (directions, data): by the Jacobian, and by the whole chain."""
     actuator = load_bench("aa-050h").actuator()
     for effect in held:
         actuator = actuator.with_effect(effect)
@@ -102,9 +92,23 @@ def along_some_directions(*held):
     directions = np.zeros((len(z) - n + 2, len(z)))
     directions[:2, :n] = rng.normal(size=(2, n))
     directions[2:, n:] = np.eye(len(z) - n)
-    expected, found = np.asarray(pushed(directions)), directions @ data_jacobian(problem, z).T
-    assert np.linalg.norm(expected, axis=1).min() > 0
-    assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * np.abs(expected).max(axis=1))
+    return directions @ data_jacobian(problem, z).T, np.asarray(pushed(directions))
+
+
+@pytest.mark.parametrize("beside", [(), pytest.param((effects.MagneticAftereffect(share=0.02),), marks=pytest.mark.long)], ids=len)
+def test_so_they_are_of_a_rod_in_shells(beside):
+    found, expected = along_some_directions(effects.FieldDiffusion(kappa=0.7), *beside)
+    largest = np.abs(expected).max(axis=1)
+    assert largest.min() > 0
+    assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
+
+
+def test_so_they_are_where_an_effect_reads_the_masses():
+    """The slope of the switching is that of all masses over the plane: without it the density's columns are 0.6 % off."""
+    found, expected = along_some_directions(effects.RateDependentSwitching(gamma=200.0, of_flux=0.9))
+    largest = np.abs(expected).max(axis=1)
+    assert largest.min() > 0
+    assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
 
 
 @pytest.fixture
