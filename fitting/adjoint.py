@@ -122,11 +122,11 @@ def read_rows(template, names, parameters, predictor, marched):
 class Rows:
     """What every line of some recordings, (recordings, lines) of each array, asks of their marches and of what is read.
 
-    `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (6, samples), see `SIGNALS`; `read`: (parameters,), of those behind the
-    march; `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom of
-    the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`: (samples, 2), of applied field and
-    current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see `magnetize`; `moving`:
-    (parameters,), of those of the march; `mean`: (), of what is added to M of all samples.
+    `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (6, samples), see `SIGNALS`; `read`:
+    (parameters,), of those behind the march; `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older
+    places,), the same of the bottom of the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`:
+    (samples, 2), of applied field and current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see
+    `magnetize`; `moving`: (parameters,), of those of the march; `mean`: (), of what is added to M of all samples.
     """
 
     marched: Marched
@@ -197,13 +197,13 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
         at[older + count - samples + end, every, 0] += (slope[:, None] * mean)[:, None] / shells
     asked = np.zeros((count, number, 2, lines))
     asked[count - samples - 1 : -1] = np.moveaxis(signals[:, :, :2], (3, 2), (0, 2))
-    kept, parameters = np.empty((count, number, added.stop - added.start, lines)), 0.0
+    through, parameters = np.empty((count, number, added.stop - added.start, lines)), 0.0
     out, back = np.zeros((number, slopes.shape[3], lines)), np.empty((number, slopes.shape[2], lines))
     for t in range(count - 1, -1, -1):
         out[:, size:-2] = at[older + t].reshape(number, 2 * shells, lines)
         out[:, -2:] = asked[t]
         np.matmul(slopes[:, t], out, out=back)
-        out[:, :size], kept[t] = back[:, state], back[:, added]
+        out[:, :size], through[t] = back[:, state], back[:, added]
         left = back[:, corners].reshape(number, 2, shells, lines)
         for s in range(shells):
             at[steps.place[:, t, s], every, :, s] += left[:, :, s]
@@ -219,11 +219,11 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     for k in range(number_of - 1, -1, -1):  # a minimum is reached from its maximum, that from the minimum before it
         known[..., 1 + k] += known[..., 1 + number_of + k]
         known[..., number_of + k if k else 0] += known[..., 1 + k]
-    kept = kept.transpose(1, 3, 0, 2)  # (recordings, lines, steps, ...)
-    drive = kept[:, :, :-1, shells : shells + 2]
+    through = through.transpose(1, 3, 0, 2)  # (recordings, lines, steps, ...)
+    drive = through[:, :, :-1, shells : shells + 2]
     drive = np.concatenate([begin.swapaxes(1, 2)[:, :, None], drive], axis=2).reshape(number, lines, -1, samples, 2).sum(axis=2)
-    drive[:, :, 0] += kept[:, :, -1, shells : shells + 2]
-    own, disturbed = kept[..., :shells], kept[..., shells + 2 :]
+    drive[:, :, 0] += through[:, :, -1, shells : shells + 2]
+    own, disturbed = through[..., :shells], through[..., shells + 2 :]
     moving = (parameters + first[:, shells + 2 :]).swapaxes(1, 2)
     marched = dataclasses.replace(marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
     return Rows(marched, signals, read, own, known[..., : older - 1], drive, disturbed, moving, mean)
