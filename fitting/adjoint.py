@@ -198,16 +198,22 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     asked = np.zeros((count, number, 2, lines))
     asked[count - samples - 1 : -1] = np.moveaxis(signals[:, :, :2], (3, 2), (0, 2))
     through, parameters = np.empty((count, number, added.stop - added.start, lines)), 0.0
+    marks = slice(size - steps.ended.shape[3], size)  # states of effects; what the end of a later period asks of them
+    later = np.zeros((number, steps.ended.shape[3], lines))
     out, back = np.zeros((number, slopes.shape[3], lines)), np.empty((number, slopes.shape[2], lines))
     for t in range(count - 1, -1, -1):
         out[:, size:-2] = at[older + t].reshape(number, 2 * shells, lines)
         out[:, -2:] = asked[t]
+        if (t + 1) % samples == 0:
+            out[:, marks] += later
+            later = steps.ended[:, t // samples].swapaxes(1, 2) @ out[:, :size]
         np.matmul(slopes[:, t], out, out=back)
         out[:, :size], through[t] = back[:, state], back[:, added]
         left = back[:, corners].reshape(number, 2, shells, lines)
         for s in range(shells):
             at[steps.place[:, t, s], every, :, s] += left[:, :, s]
         parameters = parameters + back[:, moving]
+    out[:, marks] += later
     first = steps.rest.swapaxes(1, 2) @ out[:, :size]
     at[older - 1, :, 1] += first[:, :shells]
     known = at[:older].sum(axis=3)  # shells have the same before the first step

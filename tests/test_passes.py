@@ -103,6 +103,15 @@ def test_so_they_are_of_a_rod_in_shells(beside):
     assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
 
 
+@pytest.mark.parametrize("effect", [effects.MagneticAftereffect(share=0.02), effects.SecondEddyPath(kappa=0.3)], ids=lambda e: e.name)
+def test_so_they_are_of_states_that_are_led_to_where_they_repeat(effect):
+    """The end of a period reads what stood at the one before."""
+    found, expected = along_some_directions(effect)
+    largest = np.abs(expected).max(axis=1)
+    assert largest.min() > 0
+    assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
+
+
 def test_so_they_are_where_an_effect_reads_the_masses():
     """The slope of the switching is that of all masses over the plane: without it the density's columns are 0.6 % off."""
     found, expected = along_some_directions(effects.RateDependentSwitching(gamma=200.0, of_flux=0.9))

@@ -174,12 +174,15 @@ class Steps(eqx.Module):
     `slopes`: (steps, d + 2 shells + 2, d + 3 shells + 5 + parameters), of (state after, relay fields, M of the relays, field H, magnetization)
     by (state before, fields and M of the corners, what is added to M of the relays, applied field, current, and the three of a
     disturbance, see `magnetize`, parameters). `place`: (steps, shells), of the corner; `rising`, `threshold`, A/m: of the branch.
-    `rest`: (d, shells + 2 + parameters), of the first state by (M of the relays, applied field, current, parameters).
+    `ended`: (periods, d, states), of the state after the last step of every period by what the states of effects were a period earlier
+    (`coupled._settle`); they stand last in a state. `rest`: (d, shells + 2 + parameters), of the first state by (M of the relays, applied
+    field, current, parameters).
     `corners`: (2, corners), fields of maxima and minima before the first step; `moved`: (before, 2), of the older places by the applied field
     of the first sample. `field`, `magnetization`: H and M, (steps + 1,), `relay_field`: (steps + 1, shells), A/m.
     """
 
     slopes: jax.Array
+    ended: jax.Array
     place: jax.Array
     rising: jax.Array
     threshold: jax.Array
@@ -206,13 +209,15 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     march = march_of(actuator, applied[0], current[0], h, start, scheme, period)
     shells = sum(e.shells for e in actuator.effects) or 1
     rest, shaped = _flat(march.carry)
+    shaped_marks = ravel_pytree(march.carry.marks)[1]
 
     def advance(carry, drive):
         then, row = march.advance(carry, drive)
-        return then, (_flat(carry)[0], *jnp.reshape(jnp.stack([then.memory.field, then.memory.magnetization]), (2, shells)), *row[:2])
+        relays = jnp.reshape(jnp.stack([then.memory.field, then.memory.magnetization]), (2, shells))
+        return then, (_flat(carry)[0], ravel_pytree(carry.marks)[0], *relays, *row[:2])
 
     ends = _ends_of_periods(len(applied), period)
-    flat, *rows = jax.lax.scan(advance, march.carry, (applied[1:], current[1:], ends))[1]
+    flat, marks, *rows = jax.lax.scan(advance, march.carry, (applied[1:], current[1:], ends))[1]
     first = (x * jnp.ones(shells) for x in (memory.field, memory.magnetization))
     v, m, H, M = (jnp.concatenate([x[None], y]) for x, y in zip((*first, *(x.mean() for x in march.first[:2])), rows, strict=True))
     known = jax.vmap(lambda v: _known(table, memory, v), 1, 1)(v)
@@ -221,17 +226,21 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     corner = jnp.take_along_axis(places, known.place[:, None], axis=0)
     cuts = np.cumsum([len(rest), shells, shells, shells, 2, DISTURBED])
 
-    def one(given, end, branch):
+    def one(given, marks, end, branch):
         flat, x, m, added, drive, disturbance, parameters = jnp.split(given, cuts)
         branch = branch._replace(base=branch.base + added)
         again = _stepping(made(parameters), h, scheme, period)[1]
-        v, m, after = again(shaped(flat), (*drive, end, *disturbance), branch, (x, m))
+        before = dataclasses.replace(shaped(flat), marks=shaped_marks(marks))
+        v, m, after = again(before, (*drive, end, *disturbance), branch, (x, m))
         then, (H, M, *_) = after(_Trace(jnp.reshape(v, march.carry.memory.field.shape), None))
         return jnp.concatenate([_flat(then)[0], jnp.ravel(v), jnp.ravel(m), jnp.stack([H, M])])
 
     still = jnp.broadcast_to(jnp.concatenate([jnp.zeros(DISTURBED), parameters]), (len(v) - 1, DISTURBED + len(parameters)))
     given = [flat, corner[:, 0], corner[:, 1], jnp.zeros_like(v[1:]), applied[1:, None], current[1:, None], still]
-    slopes = jax.vmap(jax.jacfwd(one))(jnp.concatenate(given, axis=1), ends, known)
+    given = jnp.concatenate(given, axis=1), marks, ends, known
+    slopes = jax.vmap(jax.jacfwd(one))(*given)
+    last = jax.tree.map(lambda x: x[period - 1 :: period], given)
+    ended = jax.vmap(jax.jacfwd(lambda marks, given: one(given[0], marks, *given[2:])[: len(rest)]))(last[1], last)
 
     def rested(given):
         m, (applied, current), parameters = given[:shells], given[shells : shells + 2], given[shells + 2 :]
@@ -241,7 +250,7 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     begin = jnp.concatenate([m[0], applied[:1], current[:1], parameters])
     moved = jax.jacfwd(lambda x: _places(table, apply_field(table, start, x), 1))(applied[0])
     ends_of_memory = jnp.stack([memory.maxima, memory.minima])
-    return Steps(slopes, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, v)
+    return Steps(slopes, ended, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, v)
 
 
 class _Rest(NamedTuple):
@@ -252,9 +261,9 @@ class _Rest(NamedTuple):
 
 
 def _flat(carry):
-    """A carry in one row, of its memory the field alone, and how to shape it again."""
+    """A carry in one row, of its memory the field alone and nothing that is a copy, and how to shape it again."""
     less = {"before": ()} if hasattr(carry, "before") else {}
-    return ravel_pytree(dataclasses.replace(carry, memory=_Trace(carry.memory.field, None), **less))
+    return ravel_pytree(dataclasses.replace(carry, memory=_Trace(carry.memory.field, None), marks=(), **less))
 
 
 def _stepping(actuator, h, scheme, period):
