@@ -14,6 +14,7 @@ from magjax.effects import CLASSES
 
 from .finer import REFINE_BELOW, finest
 from .screen import Candidate
+from .spectra import reading_range
 
 LEADERS = 6  # families of directions that are tried
 FAMILY = 0.85  # |cos| of two directions that makes a family
@@ -205,13 +206,7 @@ def _physical(effect, result) -> bool:
     info = effect.parameters()[effect.amplitude]
     largest = OUT_OF_REACH * max(map(abs, info.typical)) if info.typical and np.isinf(info.high) else np.inf
     signed = info.low < 0 or float(getattr(effect, effect.amplitude)) >= 0
-    return signed and effect.extent(_readings(result.spectra), result.actuator) <= largest and effect.is_itself()
-
-
-def _readings(spectra) -> tuple[float, float]:
-    """The lowest and the highest reading."""
-    ends = [float(s.reading[0].real) + side * s.peak_to_peak / 2 for s in spectra for side in (-1, 1)]
-    return min(ends, default=0.0), max(ends, default=0.0)
+    return signed and effect.extent(reading_range(result.spectra), result.actuator) <= largest and effect.is_itself()
 
 
 def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:

@@ -12,7 +12,7 @@ from .search import SECOND_Z, search
 from .setup import Choices
 from .task import freed_beyond
 from .together import together
-from .verdict import FULL_SHARE, HALF, NULL_CHI2, Z_THRESHOLD, too_little
+from .verdict import FULL_SHARE, HALF, NULL_CHI2, Z_THRESHOLD, as_expected, too_little
 
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CLEAR_Z = 20.0  # the score of an effect that no density imitates: on nulls at chi2/N of 3 the highest are 6 to 7
@@ -62,8 +62,9 @@ def _tells_nothing(evidence) -> bool:
 
 def is_rough(evidence, checks) -> bool:
     """Whether what is left is the density's: little (on the finest hats FINEST_BELOW), and nothing scores beyond what a rough one
-    leaves and nothing earned its place; or what earned it is clear of any density; or a finer density was asked for and what is named foretells the check
-    recordings, which took no part (without any, it must explain all but a little).
+    leaves and nothing earned its place; or what earned it is clear of any density; or a finer density was asked for and what is named
+    foretells the check recordings, which took no part, or explains all but a little and errs on them as it expects (without any,
+    it must explain all but a little).
 
     A smooth function could always be learned from it, and would be no physics.
     """
@@ -81,6 +82,8 @@ def is_rough(evidence, checks) -> bool:
     finer = choices.knots[0] > Choices().knots[0] if choices.knots is not None else choices.rest != "held"
     if not checks:
         return finer and evidence.share > FULL_SHARE
+    if finer and evidence.share > FULL_SHARE and as_expected(evidence):
+        return True
     before, after = ([misfit([row], which) for row in checks] for which in ("rms_before", "rms_after"))
     left = [a / b for a, b in zip(after, before, strict=True) if b > 1]  # of those that leave something to foretell
     return finer and sum(before) > len(checks) and sum(after) < FORETOLD * sum(before) and bool(np.median(left) < FORETOLD)

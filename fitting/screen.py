@@ -19,6 +19,7 @@ from .adjoint import as_lines
 from .columns import bare, drive_change, in_step_change, late_change, lines_of, marching, signals_of, trajectory
 from .joint import data_jacobian, data_residual
 from .model import whitened
+from .spectra import reading_range
 from .together import let_go
 from .uncertainty import UNDERSMOOTH
 
@@ -36,7 +37,7 @@ SHAPE_GRIDS = {
     "creep": {"shortest": (1e-4, 1e-2), "mean_behind": (0.0, 4.0)},
     "coulomb_friction": {"v_s": (1e-5, 1e-3), "presliding": (1e-8, 1e-7, 1e-6)},
     "sensor_lag": {"order2": (0.0, 0.5)},
-    "sensor_nonlinearity": {"c3": (-1.2, 0.0, 3.0), "c0": (-0.3, 0.0, 0.3)},
+    "sensor_nonlinearity": {"mix": (-0.25 * np.pi, 0.0, 0.25 * np.pi, 0.5 * np.pi), "c0": (-3.0, 0.0, 3.0)},
 }
 
 
@@ -61,9 +62,9 @@ class Candidate:
     bic_change: float | None = None
 
 
-def shape_grid(effect_class):
-    """All combinations of shape parameters to try: list of dicts."""
-    grid = [{}]
+def shape_grid(effect_class, readings=(0.0, 0.0)):
+    """All combinations of shape parameters to try, with what is given by the lowest and the highest reading: list of dicts."""
+    grid = [effect_class.seen_in(readings)]
     for name, values in SHAPE_GRIDS.get(effect_class.name, {}).items():
         grid = [{**g, name: v} for g in grid for v in values]
     return grid
@@ -107,12 +108,12 @@ def applicable(actuator, quasistatic: bool = False):
     return found
 
 
-def _behind(classes, predictor, actuator, signals):
+def _behind(classes, predictor, actuator, signals, readings):
     """(class, shapes) of all that act behind the hysteresis, and what they do there: (free displacement, displacement, reading)."""
     asked, rows = [], []
     for c in classes:
         if not c.in_step and c.block != "source":
-            shapes = shape_grid(c)
+            shapes = shape_grid(c, readings)
             stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shapes))
             asked += [(c, s) for s in shapes]
             rows += late_change(stacked, predictor, actuator, signals)
@@ -140,13 +141,13 @@ def _before(classes, trials, predictor, own, path, rows):
     return [asked for kind in (True, False) for asked, _ in found.get(kind, ())], lines
 
 
-def _changes(classes, trials, predictor, actuator, rows):
+def _changes(classes, trials, predictor, actuator, rows, readings):
     """(class, shapes) of every effect, and the first-order change of the lines of the predictor's recordings, (columns, recordings,
     harmonics + 1)."""
     own, number = marching(actuator), len(rows.mean)
     fields, path = trajectory(predictor, own)
     signals = signals_of(predictor, actuator, fields)
-    behind, late = _behind(classes, predictor, bare(actuator), signals)
+    behind, late = _behind(classes, predictor, bare(actuator), signals, readings)
     before, lines = _before(classes, trials, predictor, own, path, rows)
     asked = before + behind
     if behind:
@@ -169,7 +170,7 @@ def columns(problem, z):
     drives = [np.asarray(d) for d in predictor.drives]
     trials, lines = {c: c.finite_trials(drives, predictor.steps) for c in classes}, []
     for part, _, rows in problem.passes.rows(z):
-        asked, found = _changes(classes, trials, part, actuator, rows)
+        asked, found = _changes(classes, trials, part, actuator, rows, reading_range(problem.spectra))
         lines.append(found)
     lines = np.concatenate(lines, axis=1)[:, np.asarray(predictor.index)]
     still = dataclasses.replace(problem.passes.target, lines=np.zeros_like(problem.passes.target.lines))

@@ -12,6 +12,7 @@ from .attribute import (
     CLOSE,
     COMPANIONS,
     FEEDBACKS,
+    LIKE_DENSITY,
     MIN_DROP,
     MISFIT,
     SETTLED_CHI2,
@@ -36,7 +37,7 @@ from .attribute import (
 from .check import check_errors
 from .diagnosis import SILENT_CHI2
 from .exchange import backward, commuted, exchange
-from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, finest
+from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, finest, hats_of_step
 from .foretold import Foreteller
 from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .rows import SLOW
@@ -265,9 +266,10 @@ def _confirmed(before, after, foretell) -> float:
 
 def _promises(base, result, candidates) -> bool:
     """Whether a further effect promises more than half of a misfit, and more than the form of those found leaves: then the
-    density waits, for a finer one would take it up."""
+    density waits, for a finer one would take it up. It does not wait for what a rough one passes for."""
     least = max(HALF * excess_of(result), FORM_ERROR * (chi2_of(base) - chi2_of(result)))
-    return bool(candidates) and result.chi2_per_sample > FAR_BESIDE and candidates[0].z ** 2 > least
+    promised = max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)
+    return result.chi2_per_sample > FAR_BESIDE and promised > least
 
 
 def _of_two(task, best, left, good):
@@ -302,7 +304,8 @@ def _of_two(task, best, left, good):
 
 def _finer(task, current, best, good, excess, any_rest: bool = True, any_density: bool = True):
     """The best with another start memory and with a finer density where it still leaves something: both were chosen under
-    the misfit of the base. Where that changes them, the near rivals are tried again on the same. Returns the best, the
+    the misfit of the base. Where it leaves much of which nothing further promises half, only the finest hats, which must take half of
+    it. Where that changes them, the near rivals are tried again on the same. Returns the best, the
     trials beside it, and the task with what was chosen.
 
     Start memories that serve as well foretell other mean levels: the one that is tried first stands unless another is
@@ -318,9 +321,13 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
         against = against_memory([(fit.problem, fit.solution) for fit in (other, best.result)])
         if against[0] < against[1] + margin:
             found = other.choices
-    highest = max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
-    if any_density and finer_hats(chosen) and FINER_FROM[0] < best.result.chi2_per_sample < highest:
+    left, highest = best.result.chi2_per_sample, max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
+    if any_density and finer_hats(chosen) and FINER_FROM[0] < left < highest:
         found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra, refine=highest).choices
+    elif any_density and left >= highest:
+        for choices in hats_of_step(found, task.bench, 2):
+            last = task.fit_on(best.result, best.result.actuator, choices=choices)
+            found = choices if excess_of(last) < HALF * excess_of(best.result) else found
     if found == chosen:
         return best, good, task
     before, task = task, task.on(choices=found)

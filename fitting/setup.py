@@ -221,12 +221,14 @@ def _bounds(names, values, infos, log, bench):
 
 
 def _prior(bench, name, value, is_log, info):
-    """1 / standard deviation in the optimiser's coordinate: the bench's, or a very wide one that keeps it finite."""
+    """1 / standard deviation in the optimiser's coordinate: the bench's, the effect's, or a very wide one that keeps it finite."""
     if name in bench.priors:
         deviation = bench.priors[name]
         return value / deviation if is_log else info.scale / deviation
     if info.shape:  # a shape means nothing while its effect is small: hold it within about a factor of three
         return 1.0 if is_log else 0.5
+    if info.prior:
+        return info.scale / info.prior
     return NO_PRIOR
 
 

@@ -58,6 +58,12 @@ class Spectrum:
         return evaluate_lines(self.drive, phases)
 
 
+def reading_range(spectra) -> tuple[float, float]:
+    """The lowest and the highest reading of some recordings."""
+    ends = [float(s.reading[0].real) + side * s.peak_to_peak / 2 for s in spectra for side in (-1, 1)]
+    return min(ends, default=0.0), max(ends, default=0.0)
+
+
 def evaluate_lines(lines: np.ndarray, phases: np.ndarray) -> np.ndarray:
     """The real signal with Fourier coefficients `lines` (0..) at phases in cycles."""
     used = np.flatnonzero(np.abs(lines) > 0)

@@ -81,7 +81,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     worse = after > WORSE[0] * before + WORSE[1] * len(rows)
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     hardly = far_off and after > NO_BETTER[2] * before
-    if steps and (worse or hardly) and not as_expected(evidence):  # a repair that foretells no better is not physics
+    if steps and (worse or hardly) and (evidence.missing or not as_expected(evidence)):  # a repair that foretells no better is not physics
         how = "worse" if worse else "hardly better"
         return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
@@ -110,10 +110,10 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
 
 
 def as_expected(evidence) -> bool:
-    """Whether what was found meets the noise and errs on the check recordings as it expects, for cells that no recording switched,
-    and these speak for it: the plain fit expected to err less, and was wrong."""
+    """Whether what was found errs on the check recordings as it expects, for cells that no recording switched, and these speak
+    for it: the plain fit expected to err less, and was wrong."""
     foretell = evidence.reached.foretell
-    if evidence.missing or not foretell or foretell(evidence.reached.current) is None:
+    if not foretell or foretell(evidence.reached.current) is None:
         return False
     now, before = (foretell(fit).whitened for fit in (evidence.reached.current, evidence.plain))
     near = now < AS_EXPECTED or now < min(NEARER[0], NEARER[1] * before)

@@ -19,7 +19,8 @@ class ParameterInfo:
 
     `scale` is a typical size (same unit), `null` the value at which an effect vanishes, `shape` marks a parameter that
     means nothing while its effect is at null (a time constant, an exponent), `detail` one of these that the search frees only
-    where its effect leaves a misfit, `typical` an expected range.
+    where its effect leaves a misfit, `given` one that is told and never fitted, `prior` the standard deviation
+    about its null in a fit, where recordings alone would let it wander, `typical` an expected range.
     """
 
     unit: str
@@ -30,6 +31,8 @@ class ParameterInfo:
     null: float | None = None
     shape: bool = False
     detail: bool = False
+    given: bool = False
+    prior: float | None = None
     typical: tuple[float, float] | None = None
     default: float = 0.0
 
@@ -44,10 +47,12 @@ def in_numpy(module):
     return jax.tree.map(np.asarray, module)
 
 
-def param(default, unit, meaning, low=-math.inf, high=math.inf, scale=None, null=None, shape=False, detail=False, typical=None):
+def param(
+    default, unit, meaning, low=-math.inf, high=math.inf, scale=None, null=None, shape=False, detail=False, given=False, prior=None, typical=None
+):
     """Declare a physical parameter as an Equinox field; see `ParameterInfo` for the arguments."""
     size = scale if scale is not None else (abs(default) if default else 1.0)
-    info = ParameterInfo(unit, meaning, low, high, size, null, shape, detail, typical, default)
+    info = ParameterInfo(unit, meaning, low, high, size, null, shape, detail, given, prior, typical, default)
     return eqx.field(default_factory=lambda: as_float_array(default), converter=as_float_array, metadata={"param": info})
 
 

@@ -373,6 +373,36 @@ def test_crosstalk_in_detail_comes_late():
     assert np.asarray(got) == pytest.approx(late, abs=1e-12 * np.abs(late).max())
 
 
+def test_a_sensors_curve_is_legendres_about_its_range_and_straight_beyond():
+    """It has no slope and no mean where the line was laid through: a gain is the magnetization's."""
+    given = {"centre": 4e-5, "half": 1e-5}
+    shapes = {"mix": 0.7, "c4": 0.5, "c5": -0.3, "c6": 0.2}
+    series = np.polynomial.Legendre([0, 0, np.cos(0.7), np.sin(0.7), 0.5, -0.3, 0.2])
+    curve, u = effects.SensorNonlinearity(q=0.02, **shapes, **given), np.linspace(-1.25, 1.25, 1001)
+
+    def departure(effect, u):
+        y = effect.centre + effect.half * u
+        return np.asarray(effect.reading(y, None, None, actuator()) - y) / float(effect.half)
+
+    assert departure(curve, u) == pytest.approx(0.02 * series(u), abs=1e-12)
+    x, w = np.polynomial.legendre.leggauss(12)
+    assert abs(w @ departure(curve, x)) < 1e-12 and abs((w * x) @ departure(curve, x)) < 1e-12
+    for end in (-1.25, 1.25):
+        beyond = end * np.array([1.0, 1.5, 4.0])
+        assert departure(curve, beyond) == pytest.approx(0.02 * (series(end) + series.deriv()(end) * (beyond - end)), abs=1e-12)
+    assert departure(dataclasses.replace(curve, c0=jnp.asarray(2.0)), u) == pytest.approx(departure(curve, u) + 0.04, abs=1e-12)
+    travel = float(actuator().strained.reach)
+    whole, stated = effects.SensorNonlinearity(q=0.02, **shapes), effects.SensorNonlinearity(q=0.02, **shapes, centre=travel / 2, half=travel / 2)
+    y = travel * np.linspace(-0.2, 1.2, 50)
+    assert np.array_equal(whole.reading(y, None, None, actuator()), stated.reading(y, None, None, actuator()))
+
+
+def test_what_is_given_an_effect_by_the_recordings_is_not_fitted():
+    effect = effects.SensorNonlinearity(**effects.SensorNonlinearity.seen_in((2e-5, 5e-5)))
+    assert (float(effect.centre), float(effect.half)) == pytest.approx((3.5e-5, 1.5e-5))
+    assert set(effect.parameters()) - set(effect.free_parameters()) == {"centre", "half"}
+
+
 def test_details_of_a_law_are_held_until_they_are_asked_for():
     friction = effects.CoulombFriction(f=1e-6)
     assert friction.free_parameters() == ("f", "v_s", "presliding")

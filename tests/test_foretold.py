@@ -122,13 +122,13 @@ def test_a_fit_that_cannot_be_simulated_foretells_nothing(null, plain):
 
 
 @pytest.mark.parametrize(
-    ("missing", "white", "before", "says", "found"),
+    ("white", "before", "says", "found"),
     [
-        (False, 1.2, 2.0, 40.0, True), (True, 1.2, 2.0, 40.0, False), (False, 5.0, 8.0, 40.0, False), (False, 5.0, 28.0, 40.0, True),
-        (False, 9.0, 90.0, 40.0, False), (False, 1.2, 2.0, 5.0, False), (False, None, None, 0.0, False),
+        (1.2, 2.0, 40.0, True), (5.0, 8.0, 40.0, False), (5.0, 28.0, 40.0, True), (9.0, 90.0, 40.0, False), (1.2, 2.0, 5.0, False),
+        (None, None, 0.0, False),
     ],
 )  # fmt: skip
-def test_a_repair_that_errs_as_it_expects_may_be_named(missing, white, before, says, found):
+def test_a_repair_that_errs_as_it_expects_may_be_named(white, before, says, found):
     """A friction of 0.2 % took all of a misfit; check recordings, missed by five times their noise for cells that none had switched,
     got a little worse with it by chance."""
     from fitting.verdict import as_expected
@@ -140,7 +140,7 @@ def test_a_repair_that_errs_as_it_expects_may_be_named(missing, white, before, s
         def says_for(self, after, plain):
             return says
 
-    evidence = SimpleNamespace(missing=missing, plain="plain", reached=SimpleNamespace(foretell=Told(), current="now"))
+    evidence = SimpleNamespace(plain="plain", reached=SimpleNamespace(foretell=Told(), current="now"))
     assert as_expected(evidence) == found
     evidence.reached.foretell = None
     assert not as_expected(evidence)

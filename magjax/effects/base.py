@@ -79,8 +79,8 @@ class AbstractEffect(eqx.Module):
         return parameters_of(cls)
 
     def free_parameters(self) -> tuple[str, ...]:
-        """Names of what a fit frees: all but the details of the law, while these are at their defaults."""
-        known = self.parameters()
+        """Names of what a fit frees: all but what is given and the details of the law, while these are at their defaults."""
+        known = {n: info for n, info in self.parameters().items() if not info.given}
         plain = all(float(getattr(self, n)) == info.default for n, info in known.items() if info.detail)
         return tuple(n for n, info in known.items() if not (plain and info.detail))
 
@@ -103,6 +103,11 @@ class AbstractEffect(eqx.Module):
     def elsewhere(cls) -> tuple:
         """Where else a fit may begin, far from the null, for laws whose first order misleads: effects with all their parameters."""
         return ()
+
+    @classmethod
+    def seen_in(cls, readings) -> dict:
+        """What is given it by the recordings that it is to be fitted to; `readings`: their lowest and highest."""
+        return {}
 
     @property
     def marches(self) -> bool:

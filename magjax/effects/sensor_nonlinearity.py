@@ -1,56 +1,78 @@
 """sensor: its characteristic is not straight."""
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..param import param
 from .base import AbstractEffect
 
+STRAIGHT_BEYOND = 1.25  # half ranges from the middle, beyond which the curve goes on along its tangent: a polynomial would run off
+OVER_RANGE = np.linspace(-1, 1, 201)
+
 
 class SensorNonlinearity(AbstractEffect):
-    """Departure from a straight line over the range of the sensor, of second to sixth order."""
+    """Departure from the best straight line over a range of the sensor: Legendre polynomials of second to sixth order.
 
-    q2: Float[Array, ""] = param(0.0, "1", "quadratic departure at full range", scale=0.01, null=0.0, typical=(-0.1, 0.1))
-    c3: Float[Array, ""] = param(
-        0.0, "1", "cubic departure relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
+    These have no slope and no mean over the range. A curve that had some would be a gain, which no density tells from a larger
+    magnetization, and the fit would wander along it. On a rough density much of any curve is such, which the prior on q tells.
+    """
+
+    q: Float[Array, ""] = param(
+        0.0, "1", "departure of second and third order, relative to half the range", scale=0.01, null=0.0, prior=0.05, typical=(-0.1, 0.1)
     )
-    c4: Float[Array, ""] = param(
-        0.0, "1", "departure of fourth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
+    mix: Float[Array, ""] = param(
+        0.0, "rad", "of these two: second order alone at 0, third alone at pi/2", scale=1.0, shape=True, typical=(-1.6, 1.6)
     )
-    c5: Float[Array, ""] = param(
-        0.0, "1", "departure of fifth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
-    )
-    c6: Float[Array, ""] = param(
-        0.0, "1", "departure of sixth order relative to the quadratic one", scale=1.0, shape=True, typical=(-3.0, 3.0)
-    )
-    c0: Float[Array, ""] = param(
-        0.0, "1", "departure at zero relative to the quadratic one", scale=0.2, shape=True, typical=(-1.0, 1.0)
+    c4: Float[Array, ""] = param(0.0, "1", "departure of fourth order relative to q", scale=1.0, shape=True, typical=(-3.0, 3.0))
+    c5: Float[Array, ""] = param(0.0, "1", "departure of fifth order relative to q", scale=1.0, shape=True, typical=(-3.0, 3.0))
+    c6: Float[Array, ""] = param(0.0, "1", "departure of sixth order relative to q", scale=1.0, shape=True, typical=(-3.0, 3.0))
+    c0: Float[Array, ""] = param(0.0, "1", "mean departure relative to q", scale=3.0, shape=True, typical=(-10.0, 10.0))
+    centre: Float[Array, ""] = param(0.0, "m", "middle of the range, where `half` is not 0", scale=1e-5, shape=True, given=True)
+    half: Float[Array, ""] = param(
+        0.0, "m", "half of the range; 0: the range is from 0 to the saturation displacement", low=0.0, scale=1e-5, shape=True, given=True
     )
 
     name = "sensor_nonlinearity"
     block = "sensor"
-    law = "reading = y + l q2 (c0 + r^2 (1 + c3 r + c4 r^2 + c5 r^3 + c6 r^4)), r = y/l, l = saturation displacement"
-    source = "linearity error of LVDTs, as in their data sheets"
+    law = (
+        "reading = y + half q (cos(mix) P2(u) + sin(mix) P3(u) + c4 P4(u) + c5 P5(u) + c6 P6(u) + c0), u = (y - centre) / half, "
+        "along the tangent where |u| > 1.25"
+    )
+    source = "linearity error of LVDTs, as in their data sheets: from the best straight line over the range"
     signature = "distortion that is a function of y alone at every frequency; a free density absorbs it at low frequency"
-    amplitude = "q2"
+    amplitude = "q"
+
+    @classmethod
+    def seen_in(cls, readings) -> dict:
+        """The range that the line was laid through: that of the readings, m."""
+        return {"centre": 0.5 * (readings[0] + readings[1]), "half": 0.5 * (readings[1] - readings[0])}
 
     def extent(self, readings, actuator) -> float:
-        """Largest departure relative to the largest motion, over the motion that makes the readings: a polynomial may run far
-        outside it."""
-        largest, departures, motions = max(np.max(np.abs(readings)), 1e-300), [0.0], [1e-3 * np.ptp(readings)]
-        for side in (-1.0, 1.0):
-            y = side * largest * np.linspace(0, 2, 401)
-            read = np.asarray(self.reading(y, None, None, actuator))
-            low, high = min(readings[0], read[0]), max(readings[1], read[0])
-            led = np.cumprod((read >= low) & (read <= high) & (side * (read - read[0]) >= 0)).astype(bool)
-            seen = led & (read >= readings[0]) & (read <= readings[1])
-            departures.extend(np.abs(read - y)[seen])
-            motions.extend(np.abs(y)[seen])
-        return float(max(departures) / max(motions))
+        """Largest departure over the range, relative to half of it, but for a constant."""
+        return abs(float(self.q)) * float(np.abs(self._curve(OVER_RANGE)[0] - self.c0).max())
+
+    def is_itself(self) -> bool:
+        """Whether the reading rises with the motion over the range: a curve that turns stands for a density."""
+        return bool(np.all(1 + float(self.q) * np.asarray(self._curve(OVER_RANGE)[1]) > 0))
 
     def reading(self, reading, signals, line, actuator):
         """Reading through the curve."""
-        reach = actuator.strained.reach if actuator.strained is not None else 1.0
-        part = reading / reach
-        curve = part * part * (1 + part * (self.c3 + part * (self.c4 + part * (self.c5 + part * self.c6))))
-        return reading + reach * self.q2 * (self.c0 + curve)
+        travel = actuator.strained.reach if actuator.strained is not None else 1.0
+        half = jnp.where(self.half > 0, self.half, 0.5 * travel)
+        u = (reading - jnp.where(self.half > 0, self.centre, half)) / half
+        near = jnp.clip(u, -STRAIGHT_BEYOND, STRAIGHT_BEYOND)
+        value, slope = self._curve(near)
+        return reading + half * self.q * (value + slope * (u - near))
+
+    def _curve(self, u):
+        """The sum of the polynomials and its slope, by their recursion."""
+        weights = (0.0, jnp.cos(self.mix), jnp.sin(self.mix), self.c4, self.c5, self.c6)  # of the first order on
+        before, now, slopes = jnp.ones_like(u), u, (jnp.zeros_like(u), jnp.ones_like(u))
+        value, slope = self.c0 + jnp.zeros_like(u), jnp.zeros_like(u)
+        for n, weight in enumerate(weights, start=1):
+            value, slope = value + weight * now, slope + weight * slopes[1]
+            following = ((2 * n + 1) * u * now - n * before) / (n + 1)
+            slopes = slopes[1], slopes[0] + (2 * n + 1) * now
+            before, now = now, following
+        return value, slope
