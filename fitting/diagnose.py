@@ -181,8 +181,8 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
             anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
         return bool(anew)
 
-    def free_means(fit, best) -> bool:
-        if zeros and zero is None and (found := unsettled_means(task, adopted, fit, best)):
+    def free_means(fit, best, beside=()) -> bool:
+        if zeros and zero is None and (found := unsettled_means(task, adopted, fit, best, beside)):
             cleaned, own = found
             anew.append({"task": cleaned, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
         return bool(anew)

@@ -92,12 +92,14 @@ def own_zeros(task, adopted, base, candidates):
     return cleaned, (effect, rivals), freed
 
 
-def unsettled_means(task, adopted, slow, best):
+def unsettled_means(task, adopted, slow, best, beside=()):
     """Means that an effect has brought as far in each recording as the drive had run before: set free where they hold most of
     what the fit with this `slow` effect leaves, and so serve better than the `best` of all. Returns the task with free means
     and the effect with its rivals; None elsewhere.
 
     Its law has one such number for all recordings; with the others wrong, another slow effect that bends the means serves better.
+    Or means that have moved for reasons of their own, where `slow` is the best, of any kind, and they promise more than what
+    scores `beside` it.
     """
     held, bench = any(e.shapes.get("zeros") for e, _ in adopted), task.bench
     if held or bench.output != "displacement" or bench.quasistatic or not best.chi2_per_sample > MISFIT:
@@ -105,7 +107,7 @@ def unsettled_means(task, adopted, slow, best):
     excess = excess_of(slow)
     z, zeros, errors = zeros_score(slow.problem, slow.refined)
     cost = len(zeros) * np.log(best.data_count) + BIC_DROP
-    if z**2 < MEANS_HOLD * excess or chi2_of(slow) - z**2 + cost > chi2_of(best):
+    if z**2 < max([MEANS_HOLD * excess, *(c.z**2 for c in beside)]) or chi2_of(slow) - z**2 + cost > chi2_of(best):
         return None
     task.say("with means of their own", slow.chi2_per_sample)
     effect, *rivals = zeros_of(slow.spectra, z, zeros, errors, [e.name for e, _ in adopted])

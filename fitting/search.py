@@ -76,10 +76,11 @@ class Reached:
     foretell: Foreteller | None = None
 
 
-def search(task, base, candidates, check=(), ends=lambda current: False, free_means=lambda fit, best: False) -> Reached:
+def search(task, base, candidates, check=(), ends=lambda current: False, free_means=lambda fit, best, beside=(): False) -> Reached:
     """Forward: fit the leaders, adopt the best while it earns its place; then screen again. `task`: a `Task`, of what
     `base` was fitted to; `ends(fit)`: whether the fit with an effect that was adopted makes the rest of the search needless;
-    `free_means(fit, best)`: the same of that with a slow effect, whose means are not settled, beside the best."""
+    `free_means(fit, best)`: the same of that with a slow effect, whose means are not settled, beside the best; `free_means(best,
+    best, scores)`: of the best, beside which means promise more than what scores."""
     foretell = Foreteller(check, base)
     state = Reached(base, [], {}, foretell=foretell)
     scored = {c.name: c for c in candidates}
@@ -118,6 +119,8 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
         if unsure and best.drop + _confirmed(state.current, best.result, foretell) < SECOND_Z**2:
             break
         left = screened(best.result, task.choices)
+        if free_means(best.result, best.result, left):
+            return state
         if not state.steps and not _promises(base, best.result, left):
             best, left = _of_two(task, best, left, good)
         found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(base, best.result, left))

@@ -53,6 +53,8 @@ def _model(content):
     # shapes have a default, which leaves a law as it was before it had them
     if missing := [n for n, (_, info) in known.items() if n not in stated and info.null is None and not info.shape]:
         raise ConfigurationError(f"parameters lacks {', '.join(missing)}")
+    if odd := [n for n in stated if n not in known]:
+        raise ConfigurationError(f"parameters holds {', '.join(odd)}, which no block and no effect has: of another version")
     masses = np.asarray(plane["masses"], float)
     numbers = {**stated, **{f"hysteresis.{k}": plane[k] for k in ("low", "high", "offset")}, "hysteresis.masses": masses.sum()}
     numbers["hysteresis.history"] = np.asarray(plane["history"], float).sum()

@@ -366,6 +366,12 @@ def test_means_are_set_free_where_they_hold_most_of_what_a_slow_effect_leaves(mo
     assert signals_module.unsettled_means(task, [(own, [])], result(2.9, "creep"), best) is None  # once
     assert signals_module.unsettled_means(task, [], result(2.9, "creep"), result(1.2, "backlash")) is None
     assert signals_module.unsettled_means(task, [], result(6.0, "creep"), best) is None  # the best serves better
+    other = result(2.3, "coulomb_friction")  # the best may be of any kind, where they promise more than what scores beside it
+    for score, taken in ((41.0, True), (43.0, False)):
+        ends.update(freed=0.95)
+        scores = [SimpleNamespace(z=-score)]
+        assert (signals_module.unsettled_means(task, [], other, other, scores) is not None) is taken
+    ends.update(freed=1.1)
     for changed in ({"freed": 2.1}, {"freed": 1.1, "z": 20.0}):  # they take less than half of it
         ends.update(changed)
         assert signals_module.unsettled_means(task, [], result(2.9, "creep"), best) is None

@@ -156,6 +156,7 @@ def test_a_model_from_before_a_law_had_a_detail_is_read(tmp_path):
     (lambda m: m["parameters"].update({"coil.R_eddy": float("nan")}), "coil.R_eddy is not a finite number"),
     (lambda m: m["parameters"].update({"coil.R_eddy": -5.0}), "coil.R_eddy = -5 is outside"),
     (lambda m: m["parameters"].pop("mechanics.f0"), "lacks mechanics.f0"),
+    (lambda m: m["parameters"].update({"effects.sensor_nonlinearity.q2": 0.1}), "q2, which no block and no effect has: of another version"),
 ])  # fmt: skip
 def test_a_model_that_was_spoiled_is_refused(tmp_path, change, why):
     from fitting.result import write_model

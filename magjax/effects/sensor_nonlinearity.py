@@ -19,7 +19,7 @@ class SensorNonlinearity(AbstractEffect):
     """
 
     q: Float[Array, ""] = param(
-        0.0, "1", "departure of second and third order, relative to half the range", scale=0.01, null=0.0, prior=0.05, typical=(-0.1, 0.1)
+        0.0, "1", "departure of second and third order, relative to half the range", scale=0.01, null=0.0, prior=0.02, typical=(-0.1, 0.1)
     )
     mix: Float[Array, ""] = param(
         0.0, "rad", "of these two: second order alone at 0, third alone at pi/2", scale=1.0, shape=True, typical=(-1.6, 1.6)
