@@ -1,14 +1,13 @@
 """Commands as a user runs them: files, exit statuses, one-line errors with the mend, nothing half written."""
 
 import dataclasses
+import importlib
 import json
 
 import jax
 import numpy as np
 import pytest
 
-import fitting.diagnose
-import fitting.fit
 import fitting.paper
 from fitting.demo import concealed_actuator, record
 from fitting.diagnosis import Diagnosis
@@ -18,6 +17,8 @@ from magjax.cli import COMMANDS, main
 from magjax.model_file import load_model
 from magjax.recording import load_recordings
 from magjax.writers import write_recording
+
+DIAGNOSE, FIT = (importlib.import_module(f"fitting.{name}") for name in ("diagnose", "fit"))  # the modules
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def test_fit_writes_what_the_interface_promises(folder, capsys, monkeypatch):
     out = folder / "result"
     files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
     returned = []
-    monkeypatch.setattr(fitting.fit, "fit", lambda *a, **k: returned.append(fit(*a, **k)) or returned[-1])
+    monkeypatch.setattr(FIT, "fit", lambda *a, **k: returned.append(fit(*a, **k)) or returned[-1])
     assert main(["fit", *files, "--bench", "aa-050h", "--out", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     content = json.loads((out / "fit.json").read_text())
@@ -80,9 +81,7 @@ def test_fit_writes_what_the_interface_promises(folder, capsys, monkeypatch):
 
 
 def test_an_interrupted_fit_keeps_what_it_reached(folder, capsys, monkeypatch):
-    import fitting.fit as module
-
-    solve = module.solve
+    solve = FIT.solve
 
     def interrupted(*arguments, progress=None, **options):
         def stop(step, chi2):
@@ -91,7 +90,7 @@ def test_an_interrupted_fit_keeps_what_it_reached(folder, capsys, monkeypatch):
         return solve(*arguments, progress=stop, **options)
 
     files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
-    monkeypatch.setattr(module, "solve", interrupted)
+    monkeypatch.setattr(FIT, "solve", interrupted)
     assert main(["fit", *files, "--bench", "aa-050h", "--out", str(folder / "stopped")]) == 130
     said = capsys.readouterr().out
     assert "interrupted after 1 Jacobians" in said and "raise" not in said
@@ -103,7 +102,7 @@ def test_a_refused_fit_leaves_no_empty_folder(folder, capsys, monkeypatch):
     out = folder / "refused"
     assert main(["fit", *files, str(folder / "none.csv"), "--bench", "aa-050h", "--out", str(out)]) in (2, 3)
     assert not out.exists()
-    monkeypatch.setattr("fitting.fit.build_problem", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(FIT, "build_problem", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
     assert main(["fit", *files, "--bench", "aa-050h", "--out", str(out)]) == 130 and not out.exists()
     with pytest.raises(SystemExit):
         main(["fit", *files, "--bench", "aa-050h", "--cells", "-3"])
@@ -180,7 +179,7 @@ def test_a_check_recording_that_cannot_be_used_ends_nothing(tmp_path, capsys, mo
     """It takes part in no fit: it is left out and told. One that is not there is a slip of the pen."""
     held = []
     monkeypatch.setattr(
-        fitting.diagnose, "diagnose", lambda *a, check, **k: held.append(len(check)) or Diagnosis("nothing_missing", "All is well.")
+        DIAGNOSE, "diagnose", lambda *a, check, **k: held.append(len(check)) or Diagnosis("nothing_missing", "All is well.")
     )
     good, bad = write(tmp_path / "good.csv", good_rows()), write(tmp_path / "bad.csv", *spoil("clipped"))
     other = write(tmp_path / "other.csv", good_rows()[:-1])
@@ -268,12 +267,12 @@ def test_an_interrupted_diagnosis_keeps_the_plain_fit(folder, capsys, monkeypatc
 
     files = [str(p) for p in sorted(folder.glob("rec_*.csv"))]
     out = folder / "half"
-    monkeypatch.setattr("fitting.diagnose.screened", stopped)
+    monkeypatch.setattr(DIAGNOSE, "screened", stopped)
     assert main(["diagnose", *files, "--bench", "aa-050h", "--out", str(out)]) == 130
     assert "the plain fit is kept in" in capsys.readouterr().err
     assert json.loads((out / "fit.json").read_text())["parameters"]["coil.R_eddy"]["free"]
     assert load_model(out)[1].name == "aa-050h" and (out / "report.html").exists() and not (out / "diagnosis.json").exists()
-    monkeypatch.setattr("fitting.diagnose.spectra_of", stopped)
+    monkeypatch.setattr(DIAGNOSE, "spectra_of", stopped)
     assert main(["diagnose", *files, "--bench", "aa-050h", "--out", str(folder / "before")]) == 130
     assert "nothing was reached" in capsys.readouterr().err and not (folder / "before").exists()
 

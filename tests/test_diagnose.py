@@ -1,12 +1,12 @@
 """The diagnosis on concealed benches: silence on a null, the right name, the data's own problems."""
 
 import dataclasses
+import importlib
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-import fitting.diagnose as module
 import fitting.learned as learned_module
 import fitting.own_signals as signals_module
 import fitting.rough as rough_module
@@ -29,6 +29,8 @@ from fitting.task import Task
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording
+
+module = importlib.import_module("fitting.diagnose")  # not the function
 
 DRIVES = ((10, 0.8, 0.1), (50, 0.5, -0.2), (120, 0.8, 0.1), (200, 0.5, -0.2), (300, 0.8, 0.1))
 

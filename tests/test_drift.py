@@ -1,9 +1,10 @@
 """What adds to a record besides the loop: drift at a common rate, of each record by itself, hum; and check recordings without it."""
 
+import importlib
+
 import numpy as np
 import pytest
 
-import fitting.diagnose
 from fitting.diagnosis import Diagnosis
 from fitting.floors import data_problem
 from fitting.record_level import record_effects, remove_from_checks, remove_record_effect
@@ -11,6 +12,7 @@ from fitting.setup import spectra_of
 from magjax.bench import load_bench
 from magjax.recording import Recording
 
+module = importlib.import_module("fitting.diagnose")  # not the function
 BENCH = load_bench("aa-050h")
 FREQUENCIES = (10.0, 50.0, 120.0, 300.0)
 NOISE = 4e-8
@@ -89,15 +91,15 @@ def test_a_large_drift_of_every_record_is_named_and_that_of_one_spoils_it(monkey
     """Four microns of forty: what every record shows is taken out, named and told; one that drifts alone is to be recorded again."""
     plain, moved = records(), records(lambda t: 4e-6 * t / t[-1])
     runs = [moved[k] if k in drifting else plain[k] for k in range(4)]
-    monkeypatch.setattr(fitting.diagnose.Task, "fit", lambda self, *a, **k: None)
+    monkeypatch.setattr(module.Task, "fit", lambda self, *a, **k: None)
 
     def examined(task, measured, adopted, check):
         left = [np.ptp(r.channels["displacement"][::500]) for r in task.recordings]  # one sample a period
         assert max(left) < 1e-6
         return Diagnosis("attributed", f"{adopted[0][0].name} was left out.")
 
-    monkeypatch.setattr(fitting.diagnose, "_examined", examined)
-    found = fitting.diagnose.diagnose(runs, BENCH)
+    monkeypatch.setattr(module, "_examined", examined)
+    found = module.diagnose(runs, BENCH)
     assert "the reading drifts by 3e-06" in found.message and "let it warm up" in found.message
     assert found.verdict == ("data_problem" if len(drifting) == 1 else "attributed")
     assert found.message.startswith("zero_drift was left out. As recorded") == (len(drifting) == 4)

@@ -1,5 +1,6 @@
 """Files as users have them: each is read as it is meant, or refused in one line that says what to mend."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -230,7 +231,7 @@ def test_numbers_that_are_none_are_null_in_json():
     (["--profile", "f0,colour"], '"colour" is not free in this fit; free are coil.R_eddy'),
 ])  # fmt: skip
 def test_options_that_cannot_work_are_refused_first(tmp_path, options, why, capsys, monkeypatch):
-    monkeypatch.setattr("fitting.fit.fit", lambda *_, **__: pytest.fail("the fit has begun"))
+    monkeypatch.setattr(importlib.import_module("fitting.fit"), "fit", lambda *_, **__: pytest.fail("the fit has begun"))
     path = tmp_path / "rec.csv"
     path.write_text(rows())
     bench = [] if "--model" in options else ["--bench", "aa-050h"]

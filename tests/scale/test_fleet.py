@@ -1,6 +1,7 @@
 """A fleet: one fit a folder, failures as rows, the table, resumed; and the options on the command line."""
 
 import csv
+import importlib
 import json
 import signal
 import subprocess
@@ -163,7 +164,7 @@ def test_a_fit_is_kept_where_its_intervals_fail(folders, result, tmp_path, capsy
     def failing(*_, **__):
         raise ConfigurationError("no interval today")
 
-    monkeypatch.setattr("fitting.fit.fit", lambda *_, **__: result)
+    monkeypatch.setattr(importlib.import_module("fitting.fit"), "fit", lambda *_, **__: result)
     monkeypatch.setattr("fitting.scale.profile_intervals", failing)
     files = [str(p) for p in sorted((folders / "rod1").glob("rec_*.csv"))]
     arguments = ["fit", *files, "--bench", "aa-050h", "--profile", "xi", "--out", str(tmp_path / "out"), "--quiet"]
