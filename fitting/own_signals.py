@@ -107,7 +107,7 @@ def unsettled_means(task, adopted, slow, best, beside=()):
     excess = excess_of(slow)
     z, zeros, errors = zeros_score(slow.problem, slow.refined)
     cost = len(zeros) * np.log(best.data_count) + BIC_DROP
-    if z**2 < max([MEANS_HOLD * excess, *(c.z**2 for c in beside)]) or chi2_of(slow) - z**2 + cost > chi2_of(best):
+    if z**2 < max([MEANS_HOLD * excess, *(c.z**2 + cost for c in beside)]) or chi2_of(slow) - z**2 + cost > chi2_of(best):
         return None
     task.say("with means of their own", slow.chi2_per_sample)
     effect, *rivals = zeros_of(slow.spectra, z, zeros, errors, [e.name for e, _ in adopted])

@@ -119,7 +119,7 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
         if unsure and best.drop + _confirmed(state.current, best.result, foretell) < SECOND_Z**2:
             break
         left = screened(best.result, task.choices)
-        if free_means(best.result, best.result, left):
+        if best.name not in SLOW and free_means(best.result, best.result, left):
             return state
         if not state.steps and not _promises(base, best.result, left):
             best, left = _of_two(task, best, left, good)
@@ -324,13 +324,14 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
         against = against_memory([(fit.problem, fit.solution) for fit in (other, best.result)])
         if against[0] < against[1] + margin:
             found = other.choices
-    left, highest = best.result.chi2_per_sample, max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
+    ahead, left, highest = best.result, best.result.chi2_per_sample, max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
     if any_density and finer_hats(chosen) and FINER_FROM[0] < left < highest:
         found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra, refine=highest).choices
     elif any_density and left >= highest:
         for choices in hats_of_step(found, task.bench, 2):
             last = task.fit_on(best.result, best.result.actuator, choices=choices)
-            found = choices if excess_of(last) < HALF * excess_of(best.result) else found
+            if excess_of(last) < HALF * excess_of(best.result):
+                found, ahead = choices, last
     if found == chosen:
         return best, good, task
     before, task = task, task.on(choices=found)
@@ -339,7 +340,8 @@ def _finer(task, current, best, good, excess, any_rest: bool = True, any_density
     def anew(t):
         def one(say):
             told = task.on(progress=say)
-            result = told.fit_on(t.result, t.result.actuator)  # from the plain fit's density, of another memory, it may end far off
+            start = ahead if t is best else t.result
+            result = told.fit_on(start, start.actuator)  # from the plain fit's density, of another memory, it may end far off
             return settled(told, current, credited(t.candidate, result, current, result.actuator.effect(t.name), excess), excess)
 
         return one

@@ -162,7 +162,8 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     log = [i.low >= 0 and v > 0 and (i.null is None or i.shape) for i, v in zip(infos, values, strict=True)]
     scales = [i.scale for i in infos]
     lows, highs = _bounds(names, values, infos, log, bench)
-    layout = Layout.build(basis, names, values, scales, lows, highs, log, memories)
+    about = [i.null if i.prior and n not in bench.priors else v for n, v, i in zip(names, values, infos, strict=True)]
+    layout = Layout.build(basis, names, about, scales, lows, highs, log, memories)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
     corners = int(4 * np.ceil(corners / 4))
@@ -180,7 +181,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     if isinstance(bench.start, tuple) and not held:
         template = template.remembering(bench.start)
     problem = Problem(layout, template, predictors, target, tuple(spectra), basis, bench.quasistatic)
-    return problem, np.concatenate([start, np.zeros(len(names) + memories)])
+    return problem, np.concatenate([start, [layout.coordinate(n, v) for n, v in zip(names, values, strict=True)], np.zeros(memories)])
 
 
 def _padded(values, harmonics: int, missing: float):
@@ -221,7 +222,8 @@ def _bounds(names, values, infos, log, bench):
 
 
 def _prior(bench, name, value, is_log, info):
-    """1 / standard deviation in the optimiser's coordinate: the bench's, the effect's, or a very wide one that keeps it finite."""
+    """1 / standard deviation in the optimiser's coordinate: the bench's about the start, the effect's own about its null, or a very
+    wide one that keeps it finite."""
     if name in bench.priors:
         deviation = bench.priors[name]
         return value / deviation if is_log else info.scale / deviation

@@ -81,7 +81,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     worse = after > WORSE[0] * before + WORSE[1] * len(rows)
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     hardly = far_off and after > NO_BETTER[2] * before
-    if steps and (worse or hardly) and (evidence.missing or not as_expected(evidence)):  # a repair that foretells no better is not physics
+    if steps and (worse or hardly) and (evidence.missing and not rough or not as_expected(evidence)):  # a repair that foretells no better is not physics
         how = "worse" if worse else "hardly better"
         return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):

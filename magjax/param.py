@@ -48,7 +48,18 @@ def in_numpy(module):
 
 
 def param(
-    default, unit, meaning, low=-math.inf, high=math.inf, scale=None, null=None, shape=False, detail=False, given=False, prior=None, typical=None
+    default,
+    unit,
+    meaning,
+    low=-math.inf,
+    high=math.inf,
+    scale=None,
+    null=None,
+    shape=False,
+    detail=False,
+    given=False,
+    prior=None,
+    typical=None,
 ):
     """Declare a physical parameter as an Equinox field; see `ParameterInfo` for the arguments."""
     size = scale if scale is not None else (abs(default) if default else 1.0)

@@ -105,8 +105,8 @@ plt.show()
 
 # %%
 leader = ranking[0].name if ranking else "quartic_magnetostriction"
-effect = effect_of(leader, {}).with_amplitude(ranking[0].amplitude if ranking else 0.1)
-names = [f"effects.{leader}.{q}" for q in effect.parameters()]
+effect = effect_of(leader, ranking[0].shapes if ranking else {}).with_amplitude(ranking[0].amplitude if ranking else 0.1)
+names = [f"effects.{leader}.{q}" for q in effect.free_parameters()]
 repaired = fit(recordings, "aa-050h", actuator=base.actuator.with_effect(effect), extra=names, refine=False, choices=choices)
 print(repaired)
 

@@ -383,12 +383,12 @@ def a_fit_of(readings, reach=6.7e-5):
 @pytest.mark.parametrize(
     ("curve", "physical"),
     [
-        (dict(q=0.3, c0=30.0), True),
-        (dict(q=-0.1, mix=1.2), True),
-        (dict(q=0.4), False),
+        (dict(q=0.2, c0=30.0), True),
+        (dict(q=-0.1, mix=0.5), True),
+        (dict(q=0.32), False),
         (dict(q=-0.652, mix=-0.414, c4=-0.563, c5=-0.153, c6=-0.018), False),
     ],
-    ids=["a third of the range", "a little", "turns at an end", "turns within"],
+    ids=["a fifth of the range", "a little", "turns just beyond", "turns within"],
 )  # fmt: skip
 def test_a_sensors_curve_rises_over_its_range(curve, physical):
     """A curve on cells had come to fall beside a creep, R_eddy to half of its value; as a constant it may be any."""
@@ -470,6 +470,9 @@ def test_what_errs_as_it_expects_is_named_all_the_same(monkeypatch, expected, wo
     evidence = evidence_of(monkeypatch, 1.0, (1.4, 8.0), after)
     monkeypatch.setattr(fitting.verdict, "as_expected", lambda e: expected)
     assert fitting.verdict.verdict(evidence).verdict == word
+    left = evidence_of(monkeypatch, 2.2, (1.4, 8.0), after)  # what is left is a rough density's, or is not
+    assert fitting.verdict.verdict(left, rough=True).verdict == word
+    assert fitting.verdict.verdict(left).verdict == "unknown_at"
 
 
 @pytest.mark.parametrize(("after", "offered"), [((1.05, 3.0), False), ((5.0, 4.0), True)], ids=["worse", "better"])

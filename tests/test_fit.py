@@ -30,6 +30,7 @@ from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquard
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import agreeing, equation_error_start, operator_rows, unfold
 from magjax.bench import load_bench
+from magjax.effects import SensorNonlinearity
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.preisach import Preisach, density_masses
 from magjax.recording import Recording
@@ -84,6 +85,19 @@ def test_a_recording_of_few_samples_a_period_leaves_the_others_their_harmonics(r
     residual = data_residual(problem, z).reshape(-1)
     real = residual[: 4 * 41].reshape(4, 41)
     assert np.all(np.isfinite(residual)) and not real[3, bare:].any() and real[0, bare:].any()
+
+
+@pytest.mark.parametrize("start", [0.001, 0.1])
+def test_a_prior_of_a_law_is_about_its_null_wherever_a_fit_begins(recordings, bench, start):
+    actuator = bench.actuator().with_effect(SensorNonlinearity(q=start))
+    names, spectra = free_parameters(bench, actuator, ("effects.sensor_nonlinearity.q",)), spectra_of(recordings[:2], bench)
+    problem, z = build_problem(spectra, actuator, bench, names, Choices(rest="negative"))
+    k, stated = problem.layout.index("effects.sensor_nonlinearity.q"), dataclasses.replace(bench, priors={"effects.sensor_nonlinearity.q": 0.5})
+    charged = np.asarray(problem.target.priors) * z[problem.layout.density_unknowns + 1 :]
+    assert charged[k - problem.layout.density_unknowns - 1] == pytest.approx(start / 0.02) and np.count_nonzero(charged) == 1
+    assert float(problem.layout.value("effects.sensor_nonlinearity.q", jnp.asarray(z))) == pytest.approx(start)
+    problem, z = build_problem(spectra, actuator, stated, names, Choices(rest="negative"))  # the bench's word comes first
+    assert z[k] == 0 and float(problem.target.priors[k - problem.layout.density_unknowns - 1]) == pytest.approx(0.01 / 0.5)
 
 
 @pytest.mark.parametrize(("stroke", "frequency", "told"), [(6e-5, 10.0, False), (9e-5, 10.0, True), (9e-5, 300.0, False)])

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 from ..param import param
 from .base import AbstractEffect
 
-STRAIGHT_BEYOND = 1.25  # half ranges from the middle, beyond which the curve goes on along its tangent: a polynomial would run off
-OVER_RANGE = np.linspace(-1, 1, 201)
+STRAIGHT_BEYOND = 1.1  # half ranges from the middle, beyond which the curve goes on along its tangent: a polynomial would run off
+OVER_RANGE = STRAIGHT_BEYOND * np.linspace(-1, 1, 201)
 
 
 class SensorNonlinearity(AbstractEffect):
@@ -19,7 +19,13 @@ class SensorNonlinearity(AbstractEffect):
     """
 
     q: Float[Array, ""] = param(
-        0.0, "1", "departure of second and third order, relative to half the range", scale=0.01, null=0.0, prior=0.02, typical=(-0.1, 0.1)
+        0.0,
+        "1",
+        "departure of second and third order, relative to half the range",
+        scale=0.01,
+        null=0.0,
+        prior=0.02,
+        typical=(-0.1, 0.1),
     )
     mix: Float[Array, ""] = param(
         0.0, "rad", "of these two: second order alone at 0, third alone at pi/2", scale=1.0, shape=True, typical=(-1.6, 1.6)
@@ -30,14 +36,20 @@ class SensorNonlinearity(AbstractEffect):
     c0: Float[Array, ""] = param(0.0, "1", "mean departure relative to q", scale=3.0, shape=True, typical=(-10.0, 10.0))
     centre: Float[Array, ""] = param(0.0, "m", "middle of the range, where `half` is not 0", scale=1e-5, shape=True, given=True)
     half: Float[Array, ""] = param(
-        0.0, "m", "half of the range; 0: the range is from 0 to the saturation displacement", low=0.0, scale=1e-5, shape=True, given=True
+        0.0,
+        "m",
+        "half of the range; 0: from 0 to the saturation displacement, of a flux density -1 .. 1 T",
+        low=0.0,
+        scale=1e-5,
+        shape=True,
+        given=True,
     )
 
     name = "sensor_nonlinearity"
     block = "sensor"
     law = (
-        "reading = y + half q (cos(mix) P2(u) + sin(mix) P3(u) + c4 P4(u) + c5 P5(u) + c6 P6(u) + c0), u = (y - centre) / half, "
-        "along the tangent where |u| > 1.25"
+        "reading = y + half q (c0 + cos(mix) P2(u) + sin(mix) P3(u) + c4 P4(u) + c5 P5(u) + c6 P6(u)), u = (y - centre) / half + q c0, "
+        "along the tangent where |u| > 1.1"
     )
     source = "linearity error of LVDTs, as in their data sheets: from the best straight line over the range"
     signature = "distortion that is a function of y alone at every frequency; a free density absorbs it at low frequency"
@@ -49,27 +61,28 @@ class SensorNonlinearity(AbstractEffect):
         return {"centre": 0.5 * (readings[0] + readings[1]), "half": 0.5 * (readings[1] - readings[0])}
 
     def extent(self, readings, actuator) -> float:
-        """Largest departure over the range, relative to half of it, but for a constant."""
-        return abs(float(self.q)) * float(np.abs(self._curve(OVER_RANGE)[0] - self.c0).max())
+        """Largest departure over the range and a little beyond, relative to half of it, but for its mean."""
+        return abs(float(self.q)) * float(np.abs(self._curve(OVER_RANGE)[0]).max())
 
     def is_itself(self) -> bool:
-        """Whether the reading rises with the motion over the range: a curve that turns stands for a density."""
+        """Whether the reading rises with the motion over the range and beyond: a curve that turns stands for a density."""
         return bool(np.all(1 + float(self.q) * np.asarray(self._curve(OVER_RANGE)[1]) > 0))
 
     def reading(self, reading, signals, line, actuator):
         """Reading through the curve."""
-        travel = actuator.strained.reach if actuator.strained is not None else 1.0
-        half = jnp.where(self.half > 0, self.half, 0.5 * travel)
-        u = (reading - jnp.where(self.half > 0, self.centre, half)) / half
+        half, centre = (0.5 * actuator.strained.reach,) * 2 if actuator.strained is not None else (1.0, 0.0)
+        half, centre = jnp.where(self.half > 0, self.half, half), jnp.where(self.half > 0, self.centre, centre)
+        offset = self.q * self.c0
+        u = (reading - centre) / half + offset
         near = jnp.clip(u, -STRAIGHT_BEYOND, STRAIGHT_BEYOND)
         value, slope = self._curve(near)
-        return reading + half * self.q * (value + slope * (u - near))
+        return reading + half * (offset + self.q * (value + slope * (u - near)))
 
     def _curve(self, u):
         """The sum of the polynomials and its slope, by their recursion."""
         weights = (0.0, jnp.cos(self.mix), jnp.sin(self.mix), self.c4, self.c5, self.c6)  # of the first order on
         before, now, slopes = jnp.ones_like(u), u, (jnp.zeros_like(u), jnp.ones_like(u))
-        value, slope = self.c0 + jnp.zeros_like(u), jnp.zeros_like(u)
+        value, slope = jnp.zeros_like(u), jnp.zeros_like(u)
         for n, weight in enumerate(weights, start=1):
             value, slope = value + weight * now, slope + weight * slopes[1]
             following = ((2 * n + 1) * u * now - n * before) / (n + 1)
