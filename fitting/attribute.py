@@ -14,7 +14,6 @@ from magjax.effects import CLASSES
 
 from .finer import REFINE_BELOW, finest
 from .screen import Candidate
-from .spectra import reading_range
 
 LEADERS = 6  # families of directions that are tried
 FAMILY = 0.85  # |cos| of two directions that makes a family
@@ -193,20 +192,19 @@ def credited(candidate, result, base, effect, excess) -> Trial:
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
     drop = chi2_of(base) - chi2_of(result)
-    physical = all(_physical(e, result) for e in result.actuator.effects)
+    physical = all(map(_physical, result.actuator.effects))
     number = len(effect.free_parameters())
     extra = number * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
     return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), number)
 
 
-def _physical(effect, result) -> bool:
+def _physical(effect) -> bool:
     """Whether an effect's amplitude has a sign and a size that it can have, and it is what it is named for; an amplitude that
     ends in a bound of its own may run on."""
-    info = effect.parameters()[effect.amplitude]
+    info, amplitude = effect.parameters()[effect.amplitude], float(getattr(effect, effect.amplitude))
     largest = OUT_OF_REACH * max(map(abs, info.typical)) if info.typical and np.isinf(info.high) else np.inf
-    signed = info.low < 0 or float(getattr(effect, effect.amplitude)) >= 0
-    return signed and effect.extent(reading_range(result.spectra), result.actuator) <= largest and effect.is_itself()
+    return (info.low < 0 or amplitude >= 0) and abs(amplitude) <= largest and effect.is_itself()
 
 
 def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:

@@ -307,9 +307,9 @@ def _of_two(task, best, left, good):
 
 def _finer(task, current, best, good, excess, any_rest: bool = True, any_density: bool = True):
     """The best with another start memory and with a finer density where it still leaves something: both were chosen under
-    the misfit of the base. Where it leaves much of which nothing further promises half, only the finest hats, which must take half of
-    it. Where that changes them, the near rivals are tried again on the same. Returns the best, the
-    trials beside it, and the task with what was chosen.
+    the misfit of the base. Where it leaves much of which nothing further promises half, only the finest hats, which must take half
+    of it. Where that changes them, the near rivals are tried again on the same. Returns the best, the trials beside it, and the
+    task with what was chosen.
 
     Start memories that serve as well foretell other mean levels: the one that is tried first stands unless another is
     better by MIN_DROP.

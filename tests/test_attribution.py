@@ -371,13 +371,7 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
 )  # fmt: skip
 def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
     """One far beyond what is typical imitates another law; a share that has reached its bound may run on."""
-    assert _physical(CLASSES[name]().with_amplitude(amplitude), a_fit_of((0.0, 5e-5))) == physical
-
-
-def a_fit_of(readings, reach=6.7e-5):
-    low, high = readings
-    spectrum = SimpleNamespace(reading=np.array([(low + high) / 2 + 0j]), peak_to_peak=high - low)
-    return SimpleNamespace(spectra=[spectrum], actuator=SimpleNamespace(strained=SimpleNamespace(reach=reach)))
+    assert _physical(CLASSES[name]().with_amplitude(amplitude)) == physical
 
 
 @pytest.mark.parametrize(
@@ -392,7 +386,7 @@ def a_fit_of(readings, reach=6.7e-5):
 )  # fmt: skip
 def test_a_sensors_curve_rises_over_its_range(curve, physical):
     """A curve on cells had come to fall beside a creep, R_eddy to half of its value; as a constant it may be any."""
-    assert _physical(CLASSES["sensor_nonlinearity"](**curve), a_fit_of((2e-5, 5e-5))) is physical
+    assert _physical(CLASSES["sensor_nonlinearity"](**curve)) is physical
 
 
 @pytest.mark.parametrize(
@@ -418,7 +412,7 @@ def test_a_sensors_curve_rises_over_its_range(curve, physical):
 def test_a_law_bent_into_another_is_not_named(effect, physical):
     """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop, friction that
     is viscous throughout a delay beside a creep, a turn round the coil that opposes more than its field an amplifier's lag of two poles."""
-    assert _physical(effect, a_fit_of((0.0, 5e-5))) is physical
+    assert _physical(effect) is physical
 
 
 def evidence_of(monkeypatch, chi2n, before, after):

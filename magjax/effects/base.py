@@ -91,10 +91,6 @@ class AbstractEffect(eqx.Module):
             return None
         return dataclasses.replace(self, **{n: info.scale for n, info in kept.items() if info.default == 0})
 
-    def extent(self, readings, actuator) -> float:
-        """How large it is, as the typical range of its amplitude counts it; `readings`: the lowest and the highest of the fit."""
-        return abs(float(getattr(self, self.amplitude)))
-
     def is_itself(self) -> bool:
         """Whether its parameters are those of what it is named for: elsewhere its law may imitate what it is not."""
         return True

@@ -60,10 +60,6 @@ class SensorNonlinearity(AbstractEffect):
         """The range that the line was laid through: that of the readings, m."""
         return {"centre": 0.5 * (readings[0] + readings[1]), "half": 0.5 * (readings[1] - readings[0])}
 
-    def extent(self, readings, actuator) -> float:
-        """Largest departure over the range and a little beyond, relative to half of it, but for its mean."""
-        return abs(float(self.q)) * float(np.abs(self._curve(OVER_RANGE)[0]).max())
-
     def is_itself(self) -> bool:
         """Whether the reading rises with the motion over the range and beyond: a curve that turns stands for a density."""
         return bool(np.all(1 + float(self.q) * np.asarray(self._curve(OVER_RANGE)[1]) > 0))
