@@ -33,7 +33,7 @@ class SensorNonlinearity(AbstractEffect):
     c4: Float[Array, ""] = param(0.0, "1", "departure of fourth order relative to q", scale=1.0, shape=True, typical=(-3.0, 3.0))
     c5: Float[Array, ""] = param(0.0, "1", "departure of fifth order relative to q", scale=1.0, shape=True, typical=(-3.0, 3.0))
     c6: Float[Array, ""] = param(0.0, "1", "departure of sixth order relative to q", scale=1.0, shape=True, typical=(-3.0, 3.0))
-    c0: Float[Array, ""] = param(0.0, "1", "mean departure relative to q", scale=3.0, shape=True, typical=(-10.0, 10.0))
+    c0: Float[Array, ""] = param(0.0, "1", "mean departure relative to q", scale=1.0, shape=True, typical=(-3.0, 3.0))
     centre: Float[Array, ""] = param(0.0, "m", "middle of the range, where `half` is not 0", scale=1e-5, shape=True, given=True)
     half: Float[Array, ""] = param(
         0.0,
