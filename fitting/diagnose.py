@@ -5,6 +5,7 @@ catalogue off the full tangent space, real fits of the leaders, groups, checks, 
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_cha
 from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
-from .task import Task
+from .task import Clock, Late, Task
 from .verdict import HALF, WORSE, Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
 
 ABSORBED_VISIBILITY = 0.004
@@ -46,6 +47,7 @@ MISSED = 5.0  # times its noise, by which a check recording is not foretold thou
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
+LATE_TEXT = "The search was ended after {:g} minutes: with more time (--minutes) it may find more, or rivals to what it names."
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -58,20 +60,24 @@ def diagnose(
     actuator=None,
     choices: Choices = Choices(),
     progress=None,
+    minutes: float = np.inf,
 ) -> Diagnosis:
     """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
     reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
+    `minutes`: after them the search for effects ends with what it has found; the plain fit before it is waited for.
     Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all.
     """
     bench = load_bench(bench)
     recordings, check = list(recordings), list(check)
     choices = with_held_masses(choices, bench, actuator)
     if known := known_instruments(recordings, calibration, bench):
-        return diagnose_beyond(known, diagnose, recordings, bench, check, actuator, choices, progress)
-    task = Task(tuple(recordings), bench, choices, progress, actuator)
-    return _with_asked(_with_missed_check(task, _diagnosed(task, check), check), choices.only)
+        timed = functools.partial(diagnose, minutes=minutes)
+        return diagnose_beyond(known, timed, recordings, bench, check, actuator, choices, progress)
+    task = Task(tuple(recordings), bench, choices, progress, actuator, Clock(minutes))
+    found = _with_asked(_with_missed_check(task, _diagnosed(task, check), check), choices.only)
+    return dataclasses.replace(found.noted(LATE_TEXT.format(minutes)), ended_after=minutes) if task.clock.cut else found
 
 
 def _with_asked(found, only) -> Diagnosis:
@@ -104,7 +110,7 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     others are left to check: what it shows they may not reach. What is named with it must foretell the others no worse.
     """
     known = found.verdict in ("attributed", "group", "nothing_missing") and not any(r.get("joined") for r in found.check)
-    if not known or not check or len(found.check) != len(check):
+    if not known or not check or len(found.check) != len(check) or task.clock.over:
         return found
     if not (found.repaired or found.base).chi2_per_sample < MISFIT:
         return found
@@ -177,7 +183,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
         if found := hum_on_harmonics(task, adopted, current):
             cleaned, hum, _ = found
             anew.append({"task": cleaned, "adopted": [*adopted, hum]})
-        elif zero is None and (better := _better_valley(task, plain, candidates, current)):
+        elif zero is None and (better := _better_valley(task.timed, plain, candidates, current)):
             anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
         return bool(anew)
 
@@ -187,11 +193,13 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
             anew.append({"task": cleaned, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
         return bool(anew)
 
-    reached = search(task, plain, worth_a_search(plain, candidates), checks[1], begins_anew, free_means)
+    reached = search(task.timed, plain, worth_a_search(plain, candidates), checks[1], begins_anew, free_means)
+    if not anew and before_zeros and needless_zeros(before_zeros[0], reached):
+        anew.append({"task": before_zeros[0], "adopted": before_zeros[1], "zeros": False})
     if anew:
-        return _examined(measured=measured, check=check, zeros=zeros, **anew[-1])
-    if before_zeros and needless_zeros(before_zeros[0], reached):
-        return _examined(before_zeros[0], measured, before_zeros[1], check, zeros=False)
+        found = _examined(measured=measured, check=check, **{"zeros": zeros, **anew[-1]})
+        if not task.clock.cut or found.effects or found.groups or not reached.steps:  # what was begun anew came to an end
+            return found
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried), task.choices.only,
@@ -200,8 +208,20 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
 
 
 def _concluded(task, evidence) -> Diagnosis:
-    """The verdict; where no effect explains the misfit, a rough density's or with a function learned in its place."""
+    """The verdict; where no effect explains the misfit, a rough density's or with a function learned in its place. Once the time is
+    over, without what takes another fit."""
     evidence = without_chance(evidence)
+    try:
+        return _thorough(task.timed, evidence)
+    except Late:
+        found = verdict(evidence)
+    if found.verdict == "unknown_at":
+        return verdict(evidence, rough=True) if is_rough(evidence, found.check) else without_worse(evidence, found)
+    return found
+
+
+def _thorough(task, evidence) -> Diagnosis:
+    """The verdict, with the fits that may change it."""
     found = verdict(evidence)
     if rough := found.verdict == "unknown_at" and is_rough(evidence, found.check):
         found = verdict(evidence, rough=True)

@@ -33,6 +33,7 @@ class Diagnosis:
     repaired: object = None
     placebo: dict | None = None
     asked: tuple = ()  # the effects that alone were asked for, where these were named
+    ended_after: float | None = None  # minutes, where the search was ended before it was through
 
     def __str__(self):
         return f"{self.verdict}: {self._said()}"
@@ -74,7 +75,9 @@ class Diagnosis:
             "floors": self.floors, "where": self.where, "check": list(self.check), "next_experiment": self.next_experiment,
             "placebo": self.placebo, "message": self._said(), "base": self.base.as_dict() if self.base else None,
             "repaired": self.repaired.as_dict() if self.repaired else None,
-        } | {n: list(v) for n, v in (("check_left_out", self.check_left_out), ("asked", self.asked)) if v}  # fmt: skip
+        } | {n: list(v) for n, v in (("check_left_out", self.check_left_out), ("asked", self.asked)) if v} | (
+            {} if self.ended_after is None else {"ended_after": self.ended_after}
+        )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

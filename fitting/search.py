@@ -42,6 +42,7 @@ from .foretold import Foreteller
 from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .rows import SLOW
 from .screen import screened
+from .task import Late
 from .together import SIDE_BY_SIDE, let_go, together
 from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
 
@@ -66,7 +67,7 @@ class Reached:
     """The current fit, adopted trials with their rivals, all trials of the last round.
 
     `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were;
-    `foretell`: what fits say of the check recordings.
+    `foretell`: what fits say of the check recordings; `round`: trials by name of the round that is under way.
     """
 
     current: object
@@ -74,15 +75,52 @@ class Reached:
     tried: dict
     form: str | None = None
     foretell: Foreteller | None = None
+    round: dict = dataclasses.field(default_factory=dict)
+
+    def adopt(self, best, good):
+        """Go on from a trial, beside the others that earned their place."""
+        self.steps.append((best, rivals_of(best, good), good, self.current))
+        self.current, self.round = best.result, {}
 
 
 def search(task, base, candidates, check=(), ends=lambda current: False, free_means=lambda fit, best, beside=(): False) -> Reached:
     """Forward: fit the leaders, adopt the best while it earns its place; then screen again. `task`: a `Task`, of what
     `base` was fitted to; `ends(fit)`: whether the fit with an effect that was adopted makes the rest of the search needless;
     `free_means(fit, best)`: the same of that with a slow effect, whose means are not settled, beside the best; `free_means(best,
-    best, scores)`: of the best, beside which means promise more than what scores."""
-    foretell = Foreteller(check, base)
-    state = Reached(base, [], {}, foretell=foretell)
+    best, scores)`: of the best, beside which means promise more than what scores. Once the time of a timed task is over, with what
+    was fitted by then."""
+    state = Reached(base, [], {}, foretell=Foreteller(check, base))
+    try:
+        _forward_and_back(task, base, state, candidates, check, ends, free_means)
+    except Late:
+        _adopt_ended(state, check)
+    return state
+
+
+def _adopt_ended(state, check):
+    """Of a round that was ended, the best trial by then, where it is the first effect or one that a full round would not refuse."""
+    good = [t for t in state.round.values() if _earns(t)]
+    if not good:
+        return
+    best = min(good, key=lambda t: t.bic_change)
+    if state.steps:
+        least = LEAST_SHARE * max(excess_of(state.current), MIN_DROP)
+        if state.current.chi2_per_sample < MISFIT or best.drop < least:
+            return
+        if check and _predicts_worse(state.current, best.result, state.foretell):
+            return
+    state.tried = {t.name: t.candidate for t in state.round.values()} | state.tried
+    state.adopt(best, good)
+
+
+def _earns(trial) -> bool:
+    """Whether a trial takes enough for its parameters, and is physical."""
+    return trial.physical and trial.drop > MIN_DROP and trial.bic_change < -BIC_DROP
+
+
+def _forward_and_back(task, base, state, candidates, check, ends, free_means):
+    """`search` into a state that holds what was reached whenever it ends."""
+    foretell = state.foretell
     scored = {c.name: c for c in candidates}
     any_rest, made_up = task.choices.rest == "auto", None
     task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
@@ -99,14 +137,15 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
         excess = max(excess_of(state.current), MIN_DROP)
         if state.steps and _hopeless(state.current, top[0], excess):
             break
-        trials = _trials(task, state.current, top, candidates, excess)
+        trials = _trials(task, state, top, candidates, excess)
+        state.round = {t.name: t for t in trials}
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
-        good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
+        good = [t for t in trials if _earns(t)]
         if not good:
             break
         best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
         if any(free_means(t.result, best.result) for t in good if t.name in SLOW):
-            return state
+            return
         if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
             break
         if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best):
@@ -120,17 +159,16 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
             break
         left = screened(best.result, task.choices)
         if best.name not in SLOW and free_means(best.result, best.result, left):
-            return state
+            return
         if not state.steps and not _promises(base, best.result, left):
             best, left = _of_two(task, best, left, good)
         found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(base, best.result, left))
         candidates = left if found.result is best.result else screened(found.result, task.choices)
         best = found
-        state.steps.append((best, rivals_of(best, good), good, state.current))
-        state.current = best.result
+        state.adopt(best, good)
         let_go()
         if ends(state.current):
-            return state
+            return
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         backward(task, state, made_up)
         exchange(task, state, check)
@@ -138,7 +176,6 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
             exchange(task, state, check)
     if state.steps and state.current is not state.steps[-1][0].result:
         ends(state.current)
-    return state
 
 
 def _hopeless(current, leader, excess) -> bool:
@@ -146,18 +183,22 @@ def _hopeless(current, leader, excess) -> bool:
     return finest(current.choices) and current.chi2_per_sample > MISFIT and BEYOND_PROMISE * leader.z**2 < LEAST_SHARE * excess
 
 
-def _trials(task, current, top, candidates, excess) -> list[Trial]:
+def _trials(task, state, top, candidates, excess) -> list[Trial]:
     """The leaders fitted beside the current fit, two side by side, until one meets the noise; then the family of the best."""
-    trials = []
+    current, trials, state.round = state.current, [], {}
 
     def useful(*others):
         return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
 
+    def kept(trial):
+        state.round[trial.name] = trial
+        return trial
+
     def begun(c, target):
-        return lambda say: try_effect(task.on(progress=say), current, c, excess, target)
+        return lambda say: kept(try_effect(task.on(progress=say), current, c, excess, target))
 
     def ended(t, target):
-        return lambda say: settled(task.on(progress=say), current, t, excess, target)
+        return lambda say: kept(settled(task.on(progress=say), current, t, excess, target))
 
     def attempt(these):
         task.say(f"trying {' and '.join(c.name for c in these)}", current.chi2_per_sample)

@@ -1,7 +1,10 @@
-"""What all fits of one diagnosis share: the recordings, their bench, what was chosen, and who is told."""
+"""What all fits of one diagnosis share: the recordings, their bench, what was chosen, who is told, and when the search ends."""
 
 import dataclasses
+import time
 from collections.abc import Callable
+
+import numpy as np
 
 from magjax.bench import Bench
 
@@ -14,6 +17,34 @@ def freed_beyond(result) -> tuple[str, ...]:
     return tuple(n for n in result.problem.layout.names if n not in result.bench.free)
 
 
+class Late(Exception):
+    """Raised by the next word of a search whose time is over."""
+
+
+class Clock:
+    """When a search ends, `minutes` from now, or never; `cut`: whether it was ended before it was through."""
+
+    def __init__(self, minutes: float = np.inf):
+        self.end, self.cut = time.monotonic() + 60 * minutes, False
+
+    @property
+    def over(self) -> bool:
+        """Whether the time is over."""
+        return time.monotonic() > self.end
+
+    def within(self, progress):
+        """The progress function that raises `Late` once the time is over."""
+
+        def say(*words):
+            if self.over:
+                self.cut = True
+                raise Late
+            if progress is not None:
+                progress(*words)
+
+        return say
+
+
 @dataclasses.dataclass(frozen=True)
 class Task:
     """Recordings of a bench to be fitted; `actuator`: what the user gave to start from, or None."""
@@ -23,6 +54,12 @@ class Task:
     choices: Choices = Choices()
     progress: Callable | None = None
     actuator: object = None
+    clock: Clock = dataclasses.field(default_factory=Clock)
+
+    @property
+    def timed(self):
+        """The same, ended by its clock: at its next word a fit raises `Late`."""
+        return self.on(progress=self.clock.within(self.progress))
 
     @property
     def held(self) -> tuple[str, ...]:

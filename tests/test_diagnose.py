@@ -25,7 +25,7 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
 from fitting.spectra import line_deviations
-from fitting.task import Task
+from fitting.task import Clock, Late, Task
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording
@@ -118,6 +118,50 @@ def test_names_a_concealed_sensor_filter(bench):
     assert named.achieved_chi2_drop == pytest.approx(chi2_of(found.base) - chi2_of(found.repaired))
     assert named.bic_change == pytest.approx(2 * np.log(found.base.data_count) - named.achieved_chi2_drop)
     assert not set(found.absorbed) & {c.name for c in found.candidates if c.achieved_chi2_drop is not None}
+
+
+@pytest.mark.parametrize(("ends", "said", "named"), [("at once", "unknown_at", []), ("after the leaders", "attributed", ["sensor_lag"])])
+def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, ends, said, named):
+    runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
+    asked = {"sensor_lag", "amplifier_lag", "transport_delay", "duffing_stiffness"}
+    choices = Choices(fine=250, without=tuple(e.name for e in CATALOGUE if e.name not in asked))
+    clock, family = Clock(1e-9 if ends == "at once" else np.inf), search_module.family
+
+    def over(*arguments):
+        clock.end = 0.0
+        return family(*arguments)
+
+    monkeypatch.setattr(module, "Clock", lambda minutes: clock)
+    monkeypatch.setattr(search_module, "family", over)
+    found = diagnose(runs, bench, check=checks, choices=choices, minutes=2.5)
+    assert clock.cut and found.verdict == said and [e["name"] for e in found.effects] == named
+    assert "ended after 2.5 minutes" in found.message and found.as_dict()["ended_after"] == 2.5
+    assert found.base.converged and (found.repaired is not None) == bool(named)
+
+
+@pytest.mark.parametrize(
+    ("taken", "left", "adopted"),
+    [(800.0, 1.0, ["creep", "backlash"]), (20.0, 12.8, ["creep"]), (100.0, 12.0, ["creep"])],
+    ids=["much", "less than an effect must", "a little of a misfit"],
+)
+def test_of_a_round_that_was_ended_the_best_trial_is_kept_where_a_full_round_would_keep_it(monkeypatch, taken, left, adopted):
+    plain, first, second = a_fit(30.0, 58.0), a_fit(13.0, 60.0, "creep"), a_fit(left, 62.0, "creep", "backlash")
+    rounds = iter([[trial("creep", first, 1700.0)], None])
+
+    def trials(task, state, *_):
+        if ended := next(rounds):
+            return ended
+        state.round = {"backlash": trial("backlash", second, taken)}
+        raise Late
+
+    for name, made in {
+        "leaders": lambda candidates: candidates, "_trials": trials, "screened": lambda *a: [scored("backlash", 20.0)],
+        "_finer": lambda task, now, best, good, *a: (best, good, task), "_of_two": lambda task, best, left, good: (best, left),
+    }.items():  # fmt: skip
+        monkeypatch.setattr(search_module, name, made)
+    reached = search_module.search(Task((), None), plain, [scored("creep", 40.0)])
+    assert [best.name for best, *_ in reached.steps] == adopted
+    assert reached.current is (second if len(adopted) > 1 else first)
 
 
 def scored(name, z, visibility=0.1, **achieved):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from magjax.errors import ConfigurationError, MagjaxError
 
-from .runtime import Progress, as_json, output_folder, parser, positive, prepare_jax, told
+from .runtime import Progress, as_json, minutes, output_folder, parser, positive, prepare_jax, told
 from .scale import (
     add_intervals,
     add_where,
@@ -19,6 +19,7 @@ from .scale import (
     with_placebo,
 )
 
+MINUTES = 15.0  # of a search for effects
 MOST_CELLS = 120  # a mass a cell: 7260 of them, and a normal matrix of 420 MB
 
 
@@ -173,6 +174,8 @@ def run_diagnose(arguments) -> int:
     )
     p.add_argument("--only", nargs="+", action="extend", default=[], metavar="EFFECT",
                    help="ask for these effects alone (`docs/effects.md` has the names); drift, heat and hum are told in any case")  # fmt: skip
+    p.add_argument("--minutes", type=minutes, default=MINUTES,
+                   help=f"after them the search for effects ends with what it has found, inf: never (default {MINUTES:g})")  # fmt: skip
     p.add_argument("--placebo", type=int, default=0, metavar="N",
                    help="search N simulations of the final model for what they do not lack: how often the search cries wolf (some seconds each, more where the screening alarms)")  # fmt: skip
     add_where(p, "the placebo's finished searches")
@@ -205,7 +208,8 @@ def run_diagnose(arguments) -> int:
         checks, refused = load_checks(options.check, bench)
         with Progress(options.quiet) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
-                             choices=Choices(max_jacobians=options.max_jacobians, only=tuple(options.only)), progress=progress).without_checks(refused)  # fmt: skip
+                             choices=Choices(max_jacobians=options.max_jacobians, only=tuple(options.only)), progress=progress,
+                             minutes=options.minutes).without_checks(refused)  # fmt: skip
             if options.placebo and found.verdict != "data_problem":
                 try:
                     found = with_placebo(found, [*recordings, *found.parted(checks)[0]], options, progress)

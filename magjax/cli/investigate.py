@@ -67,7 +67,7 @@ def analysis(bench, folder, options, live):
             if errors:
                 raise errors[0]
             held, refused = load_checks(checks, bench)
-            found = diagnose(recordings, bench, check=held, progress=progress).without_checks(refused)
+            found = diagnose(recordings, bench, check=held, progress=progress, minutes=options.minutes).without_checks(refused)
         except RecordingError as error:
             found, shown = unusable(errors or [error], recordings if errors else ()), error.shown
         content = found.as_dict()

@@ -48,6 +48,13 @@ def positive(text: str) -> int:
     return int(text)
 
 
+def minutes(text: str) -> float:
+    """A time above zero, inf for no limit, for an option's `type`."""
+    if not float(text) > 0:
+        raise ValueError
+    return float(text)
+
+
 def seed(text: str) -> int:
     """A whole number of zero or more, for an option's `type`."""
     if int(text) < 0:

@@ -78,6 +78,7 @@ DIAGNOSIS = {
     "where": "where the misfit of the base sits",
     "check": "one entry a check recording and channel; with `joined`, true, for one that joined the recordings, which did not reach what it shows",
     "check_left_out": "only where a check recording could not be used: a sentence for each",
+    "ended_after": "only where the search for effects was ended before it was through (--minutes): after how many minutes",
     "next_experiment": "null, or the recording that best tells the rivals apart",
     "placebo": "null, or how often the same search cries wolf on simulations of the final model (--placebo)",
     "base": "the content of fit.json for the model without the effects",
