@@ -126,12 +126,16 @@ def _effect_row(trial, tried, base, final) -> dict:
 
 
 def sizes_of(name, result) -> dict:
-    """The parameters of an effect as a fit has them, without the details of its law that were held."""
+    """The parameters of an effect as a fit has them, and what was given it, without error; not the details of its law that were held."""
     prefix = f"effects.{name}."
-    return {
+    fitted = {
         e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit}
         for e in result.estimates
         if e.name.startswith(prefix) and e.free
+    }
+    given = {n: info.unit for n, info in CLASSES[name].parameters().items() if info.given}
+    return fitted | {
+        n: {"value": float(getattr(result.actuator.effect(name), n)), "stderr": 0.0, "unit": unit} for n, unit in given.items()
     }
 
 

@@ -137,7 +137,8 @@ def _forward_and_back(task, base, state, candidates, check, ends, free_means):
         excess = max(excess_of(state.current), MIN_DROP)
         if state.steps and _hopeless(state.current, top[0], excess):
             break
-        trials = _trials(task, state, top, candidates, excess)
+        state.round = {}
+        trials = _trials(task, state.current, top, candidates, excess, state.round)
         state.round = {t.name: t for t in trials}
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good = [t for t in trials if _earns(t)]
@@ -183,15 +184,16 @@ def _hopeless(current, leader, excess) -> bool:
     return finest(current.choices) and current.chi2_per_sample > MISFIT and BEYOND_PROMISE * leader.z**2 < LEAST_SHARE * excess
 
 
-def _trials(task, state, top, candidates, excess) -> list[Trial]:
-    """The leaders fitted beside the current fit, two side by side, until one meets the noise; then the family of the best."""
-    current, trials, state.round = state.current, [], {}
+def _trials(task, current, top, candidates, excess, ended_so_far) -> list[Trial]:
+    """The leaders fitted beside the current fit, two side by side, until one meets the noise; then the family of the best.
+    `ended_so_far`: a dict that holds each trial by name as soon as it has ended."""
+    trials = []
 
     def useful(*others):
         return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
 
     def kept(trial):
-        state.round[trial.name] = trial
+        ended_so_far[trial.name] = trial
         return trial
 
     def begun(c, target):

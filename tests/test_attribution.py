@@ -13,6 +13,7 @@ import fitting.verdict
 from fitting.attribute import Trial, _physical, chi2_of, confidence, excess_of, family, leaders, rivals_of, tie_of
 from fitting.diagnosis import Evidence
 from fitting.record_level import RecordEffect
+from fitting.report.diagnosis_page import _size
 from fitting.rows import behind, creeps_on, sizes_of, ties_of
 from fitting.screen import Candidate
 from fitting.search import Reached
@@ -20,7 +21,8 @@ from fitting.setup import Choices
 from fitting.task import Task
 from fitting.uncertainty import Estimate
 from fitting.verdict import _grouped, dominant, first_alone, too_little, unconfirmed  # fmt: skip
-from magjax.effects import CLASSES
+from magjax.bench import load_bench
+from magjax.effects import CLASSES, SensorNonlinearity
 
 COUNT = 700
 
@@ -552,7 +554,7 @@ def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypat
     base = trial("excess_loss", 150.0).result
     ends = {"excess_loss": 1.6, "rate_dependent_switching": left}  # beside it
 
-    def fitted(task, current, top, candidates, excess):
+    def fitted(task, current, top, candidates, excess, so_far):
         name = "excess_loss" if current is base else "rate_dependent_switching"
         return [trial(name, ends[name], base=current.chi2_per_sample)]
 
@@ -702,7 +704,7 @@ def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, leader
     monkeypatch.setattr(fitting.search, "settled", lambda task, current, t, excess, target: t)
     task = Task((), None, progress=lambda *a: None)
     current = SimpleNamespace(chi2_per_sample=100.0, data_count=COUNT)
-    assert names(fitting.search._trials(task, current, rows[:1], rows, 99.0 * COUNT)) == tried
+    assert names(fitting.search._trials(task, current, rows[:1], rows, 99.0 * COUNT, {})) == tried
 
 
 @pytest.mark.parametrize(("z", "tried"), [(9.7, True), (4.0, False)])
@@ -715,7 +717,7 @@ def test_a_feedback_that_scores_is_tried_though_another_meets_the_noise(monkeypa
     monkeypatch.setattr(fitting.search, "settled", lambda task, current, t, excess, target: t)
     monkeypatch.setattr(fitting.search, "in_detail", lambda task, base, t, excess: t)
     current = SimpleNamespace(chi2_per_sample=1.3, data_count=COUNT)
-    found = fitting.search._trials(Task((), None, progress=lambda *a: None), current, leaders(rows), rows, 0.38 * COUNT)
+    found = fitting.search._trials(Task((), None, progress=lambda *a: None), current, leaders(rows), rows, 0.38 * COUNT, {})
     assert ("stress_feedback" in names(found)) is tried
 
 
@@ -820,6 +822,17 @@ def test_details_of_a_law_that_were_held_are_no_size():
     estimates.append(Estimate("effects.creep.gain", 0.1, 0.01, "1", "", True, 0.0))
     sizes = sizes_of("excess_loss", SimpleNamespace(estimates=estimates))
     assert {n: (p["value"], p["stderr"]) for n, p in sizes.items()} == {"k": (26.0, 1.1), "rate_knee": (3.8, 2.0)}
+
+
+def test_the_range_of_a_sensors_curve_stands_beside_its_size():
+    """Without it a departure of a share of half the range says nothing."""
+    actuator = load_bench("aa-050h").actuator().with_effect(SensorNonlinearity(q=0.02, centre=3e-6, half=2e-5))
+    estimates = [Estimate("effects.sensor_nonlinearity.q", 0.02, 0.001, "1", "", True, 0.0)]
+    sizes = sizes_of("sensor_nonlinearity", SimpleNamespace(estimates=estimates, actuator=actuator))
+    assert {n: (p["value"], p["stderr"], p["unit"]) for n, p in sizes.items()} == {
+        "q": (0.02, 0.001, "1"), "centre": (3e-6, 0.0, "m"), "half": (2e-5, 0.0, "m")
+    }  # fmt: skip
+    assert _size(sizes) == "q = 0.02 ± 0.001; centre = 3e−6 m (given); half = 2e−5 m (given)"
 
 
 def test_rivals_that_meet_the_noise_are_compared_with_the_details_of_their_laws(monkeypatch):

@@ -148,10 +148,10 @@ def test_of_a_round_that_was_ended_the_best_trial_is_kept_where_a_full_round_wou
     plain, first, second = a_fit(30.0, 58.0), a_fit(13.0, 60.0, "creep"), a_fit(left, 62.0, "creep", "backlash")
     rounds = iter([[trial("creep", first, 1700.0)], None])
 
-    def trials(task, state, *_):
+    def trials(task, current, top, candidates, excess, so_far):
         if ended := next(rounds):
             return ended
-        state.round = {"backlash": trial("backlash", second, taken)}
+        so_far["backlash"] = trial("backlash", second, taken)
         raise Late
 
     for name, made in {

@@ -102,11 +102,14 @@ def _named(found, facts):
 
 
 def _size(parameters) -> str:
-    """Parameters with their errors."""
-    return "; ".join(
-        f"{n} = {tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'])}".strip()
-        for n, p in parameters.items()
-    )
+    """Parameters with their errors; what was given has none."""
+
+    def one(p):
+        if p["stderr"] == 0:
+            return f"{plain(p['value'], 4)} {unit_text(p['unit'])} (given)"
+        return f"{tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'])}".strip()
+
+    return "; ".join(f"{n} = {one(p)}" for n, p in parameters.items())
 
 
 def _groups(found, facts):

@@ -94,7 +94,7 @@ INNER = {
     "effects[].parameters": "its parameters: name -> value, stderr, unit",
     "effects[].parameters.*": "one parameter",
     "effects[].parameters.*.value": "estimate",
-    "effects[].parameters.*.stderr": "standard error",
+    "effects[].parameters.*.stderr": "standard error; 0 where it was given: the range of a sensor's curve",
     "effects[].parameters.*.unit": "unit of both",
     "effects[].confidence": "0 .. 1, against the rivals that were fitted",
     "effects[].shifts": "what the base had got wrong to hide it",
