@@ -4,6 +4,7 @@ Order: data first, then the base fit to its floor, record-level effects between 
 catalogue off the full tangent space, real fits of the leaders, groups, checks, the next experiment, the verdict.
 """
 
+import contextlib
 import dataclasses
 import functools
 
@@ -47,7 +48,7 @@ MISSED = 5.0  # times its noise, by which a check recording is not foretold thou
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
-LATE_TEXT = "The search was ended after {:g} minutes: with more time (--minutes) it may find more, or rivals to what it names."
+LATE_TEXT = "The search was cut short by its limit of {:g} min (--minutes); with more time it may find more, or rivals to what it names."
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -66,15 +67,16 @@ def diagnose(
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
     reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
-    `minutes`: after them the search for effects ends with what it has found; the plain fit before it is waited for.
+    `minutes`: after them, from the beginning, the search for effects ends with what it has found; the plain fit before it is
+    waited for.
     Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all.
     """
     bench = load_bench(bench)
     recordings, check = list(recordings), list(check)
     choices = with_held_masses(choices, bench, actuator)
     if known := known_instruments(recordings, calibration, bench):
-        timed = functools.partial(diagnose, minutes=minutes)
-        return diagnose_beyond(known, timed, recordings, bench, check, actuator, choices, progress)
+        within = functools.partial(diagnose, minutes=minutes)
+        return diagnose_beyond(known, within, recordings, bench, check, actuator, choices, progress)
     task = Task(tuple(recordings), bench, choices, progress, actuator, Clock(minutes))
     found = _with_asked(_with_missed_check(task, _diagnosed(task, check), check), choices.only)
     return dataclasses.replace(found.noted(LATE_TEXT.format(minutes)), ended_after=minutes) if task.clock.cut else found
@@ -110,7 +112,7 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     others are left to check: what it shows they may not reach. What is named with it must foretell the others no worse.
     """
     known = found.verdict in ("attributed", "group", "nothing_missing") and not any(r.get("joined") for r in found.check)
-    if not known or not check or len(found.check) != len(check) or task.clock.over:
+    if not known or not check or len(found.check) != len(check):
         return found
     if not (found.repaired or found.base).chi2_per_sample < MISFIT:
         return found
@@ -123,8 +125,11 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     told = f"{name} is missed by {ratios[worst]:.0f} times its noise, though the fit meets its own"
     if not left:
         return found.noted(f"{told}: the recordings do not reach what it shows; give it as one of them, and others to check.")
-    task.say(f"with {name} among the recordings")
-    again = _diagnosed(task.on(recordings=(*task.recordings, missed)), left)
+    with contextlib.suppress(Late):
+        task.sparing.say(f"with {name} among the recordings")
+        again = _diagnosed(task.on(recordings=(*task.recordings, missed)), left)
+    if task.clock.cut:
+        return found.noted(f"{told}: there was no time to ask for what it shows beside the recordings.")
     rest = [r for k, r in enumerate(found.check) if k != worst]
     met = again.verdict in ("attributed", "group") and again.repaired.chi2_per_sample < MISFIT
     before, after = misfit(rest, "rms_after"), misfit(again.check, "rms_after")
@@ -180,26 +185,30 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     anew = []  # what the diagnosis begins anew with: recordings without what showed beside an effect, or a better plain fit
 
     def begins_anew(current) -> bool:
-        if found := hum_on_harmonics(task, adopted, current):
-            cleaned, hum, _ = found
-            anew.append({"task": cleaned, "adopted": [*adopted, hum]})
-        elif zero is None and (better := _better_valley(task.timed, plain, candidates, current)):
-            anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
+        with contextlib.suppress(Late):
+            if found := hum_on_harmonics(task.sparing, adopted, current):
+                cleaned, hum, _ = found
+                anew.append({"task": task.on(recordings=cleaned.recordings), "adopted": [*adopted, hum]})
+            elif zero is None and (better := _better_valley(task.sparing, plain, candidates, current)):
+                anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
         return bool(anew)
 
     def free_means(fit, best, beside=()) -> bool:
-        if zeros and zero is None and (found := unsettled_means(task, adopted, fit, best, beside)):
-            cleaned, own = found
-            anew.append({"task": cleaned, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
+        with contextlib.suppress(Late):
+            if zeros and zero is None and (found := unsettled_means(task.sparing, adopted, fit, best, beside)):
+                cleaned, own = found
+                freed = task.on(recordings=cleaned.recordings)
+                anew.append({"task": freed, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
         return bool(anew)
 
     reached = search(task.timed, plain, worth_a_search(plain, candidates), checks[1], begins_anew, free_means)
-    if not anew and before_zeros and needless_zeros(before_zeros[0], reached):
-        anew.append({"task": before_zeros[0], "adopted": before_zeros[1], "zeros": False})
     if anew:
-        found = _examined(measured=measured, check=check, **{"zeros": zeros, **anew[-1]})
-        if not task.clock.cut or found.effects or found.groups or not reached.steps:  # what was begun anew came to an end
-            return found
+        return _examined(measured=measured, check=check, zeros=zeros, **anew[-1])
+    needless = False
+    with contextlib.suppress(Late):
+        needless = before_zeros and needless_zeros(before_zeros[0].sparing, reached)
+    if needless:
+        return _examined(before_zeros[0], measured, before_zeros[1], check, zeros=False)
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried), task.choices.only,
@@ -214,7 +223,8 @@ def _concluded(task, evidence) -> Diagnosis:
     try:
         return _thorough(task.timed, evidence)
     except Late:
-        found = verdict(evidence)
+        evidence = evidence.cut_short()
+    found = verdict(evidence)
     if found.verdict == "unknown_at":
         return verdict(evidence, rough=True) if is_rough(evidence, found.check) else without_worse(evidence, found)
     return found

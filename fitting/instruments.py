@@ -304,7 +304,8 @@ def _joined(known, found, plain, final, check_plain, check, bench, texts):
             f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in checks
         )
         text += f" On check recordings: {better}."
-    rest = "Beyond that nothing is missing." if found.verdict == "nothing_missing" else f"Beyond that: {found.message}"
+    nothing = found.verdict == "nothing_missing" and found.ended_after is None
+    rest = "Beyond that nothing is missing." if nothing else f"Beyond that: {found.message}"
     return dataclasses.replace(
         found,
         verdict=verdict,

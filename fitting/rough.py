@@ -147,7 +147,7 @@ def beside_cells(task, evidence) -> Evidence | None:
     worth = {t.name for t in good if t.drop > HALF * first.drop and t.name not in LIKE_DENSITY}
     candidates = screened(cells, task.choices)
     reached = search(task, cells, [c for c in candidates if c.name in worth], evidence.checks[1])
-    if not reached.steps or not reached.current.chi2_per_sample < CELLS_LEAVE or reached.form:
+    if reached.ended or not reached.steps or not reached.current.chi2_per_sample < CELLS_LEAVE or reached.form:
         return None
     if len(reached.steps) == 1:  # of rivals those that leave nothing that scores
         _, tied, good, _ = reached.steps[0]

@@ -135,7 +135,8 @@ def sizes_of(name, result) -> dict:
     }
     given = {n: info.unit for n, info in CLASSES[name].parameters().items() if info.given}
     return fitted | {
-        n: {"value": float(getattr(result.actuator.effect(name), n)), "stderr": 0.0, "unit": unit} for n, unit in given.items()
+        n: {"value": float(getattr(result.actuator.effect(name), n)), "stderr": 0.0, "unit": unit, "given": True}
+        for n, unit in given.items()
     }
 
 

@@ -67,7 +67,8 @@ class Reached:
     """The current fit, adopted trials with their rivals, all trials of the last round.
 
     `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were;
-    `foretell`: what fits say of the check recordings; `round`: trials by name of the round that is under way.
+    `foretell`: what fits say of the check recordings; `under_way`: trials by name of a round that has not come to its end;
+    `ended`: whether the time was over before the search was through.
     """
 
     current: object
@@ -75,108 +76,128 @@ class Reached:
     tried: dict
     form: str | None = None
     foretell: Foreteller | None = None
-    round: dict = dataclasses.field(default_factory=dict)
+    under_way: dict = dataclasses.field(default_factory=dict)
+    ended: bool = False
 
     def adopt(self, best, good):
         """Go on from a trial, beside the others that earned their place."""
         self.steps.append((best, rivals_of(best, good), good, self.current))
-        self.current, self.round = best.result, {}
+        self.current, self.under_way = best.result, {}
 
 
 def search(task, base, candidates, check=(), ends=lambda current: False, free_means=lambda fit, best, beside=(): False) -> Reached:
     """Forward: fit the leaders, adopt the best while it earns its place; then screen again. `task`: a `Task`, of what
     `base` was fitted to; `ends(fit)`: whether the fit with an effect that was adopted makes the rest of the search needless;
     `free_means(fit, best)`: the same of that with a slow effect, whose means are not settled, beside the best; `free_means(best,
-    best, scores)`: of the best, beside which means promise more than what scores. Once the time of a timed task is over, with what
-    was fitted by then."""
+    best, scores)`: of the best, beside which means promise more than what scores. A timed task's search ends with what it has:
+    the best that was fitted in a round under way, where the round would not have refused it."""
     state = Reached(base, [], {}, foretell=Foreteller(check, base))
+    scored = {c.name: c for c in candidates}
+    task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
     try:
-        _forward_and_back(task, base, state, candidates, check, ends, free_means)
+        task, made_up, needless = _forward(task, base, state, candidates, check, ends, free_means)
+        state.under_way = {}
+        if needless:
+            return state
+        if state.current.chi2_per_sample < FAR_FROM_NOISE:
+            backward(task, state, made_up)
+            exchange(task, state, check)
+            if commuted(task, state, scored.get("sensor_lag")):
+                exchange(task, state, check)
+        if state.steps and state.current is not state.steps[-1][0].result:
+            ends(state.current)
     except Late:
-        _adopt_ended(state, check)
+        state.ended = True
+        _adopt_of(state, base, check)
     return state
 
 
-def _adopt_ended(state, check):
-    """Of a round that was ended, the best trial by then, where it is the first effect or one that a full round would not refuse."""
-    good = [t for t in state.round.values() if _earns(t)]
-    if not good:
-        return
-    best = min(good, key=lambda t: t.bic_change)
-    if state.steps:
-        least = LEAST_SHARE * max(excess_of(state.current), MIN_DROP)
-        if state.current.chi2_per_sample < MISFIT or best.drop < least:
-            return
-        if check and _predicts_worse(state.current, best.result, state.foretell):
-            return
-    state.tried = {t.name: t.candidate for t in state.round.values()} | state.tried
-    state.adopt(best, good)
-
-
-def _earns(trial) -> bool:
-    """Whether a trial takes enough for its parameters, and is physical."""
-    return trial.physical and trial.drop > MIN_DROP and trial.bic_change < -BIC_DROP
-
-
-def _forward_and_back(task, base, state, candidates, check, ends, free_means):
-    """`search` into a state that holds what was reached whenever it ends."""
-    foretell = state.foretell
-    scored = {c.name: c for c in candidates}
+def _forward(task, base, state, candidates, check, ends, free_means):
+    """The rounds, into the `state`. Returns the task on the density that was chosen beside the effects, the candidate of
+    `state.form`, and whether the rest of the search is needless."""
     any_rest, made_up = task.choices.rest == "auto", None
-    task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
-        calm = state.steps and state.current.chi2_per_sample < SILENT_CHI2
         if not top or abs(top[0].z) < Z_THRESHOLD:
             break
-        unsure = calm and abs(top[0].z) < SECOND_Z
-        if unsure and not foretell:
+        unsure = _calm(state) and abs(top[0].z) < SECOND_Z
+        if unsure and not state.foretell:
             break
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
         excess = max(excess_of(state.current), MIN_DROP)
         if state.steps and _hopeless(state.current, top[0], excess):
             break
-        state.round = {}
-        trials = _trials(task, state.current, top, candidates, excess, state.round)
-        state.round = {t.name: t for t in trials}
+        state.under_way = {}
+        trials = _trials(task, state.current, top, candidates, excess, state.under_way)
+        state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
-        good = [t for t in trials if _earns(t)]
-        if not good:
+        good, best = _best_of(trials)
+        if best is None:
             break
-        best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5))
         if any(free_means(t.result, best.result) for t in good if t.name in SLOW):
-            return
-        if state.steps and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT:
+            return task, made_up, True
+        if _takes_too_little(state, best, excess):
             break
-        if best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best):
-            if check and not _predicts_worse(state.current, best.result, foretell):
+        if _makes_up_for_form(state, base, best):
+            if check and not _predicts_worse(state.current, best.result, state.foretell):
                 state.current, state.form, made_up = best.result, best.name, best.candidate
             break
-        further = state.steps and check and not _decides(state.current, best, excess)
-        if further and _predicts_worse(state.current, best.result, foretell):
-            break
-        if unsure and best.drop + _confirmed(state.current, best.result, foretell) < SECOND_Z**2:
+        if _not_confirmed(state, best, excess, check, unsure):
             break
         left = screened(best.result, task.choices)
         if best.name not in SLOW and free_means(best.result, best.result, left):
-            return
+            return task, made_up, True
         if not state.steps and not _promises(base, best.result, left):
             best, left = _of_two(task, best, left, good)
         found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(base, best.result, left))
         candidates = left if found.result is best.result else screened(found.result, task.choices)
-        best = found
-        state.adopt(best, good)
+        state.adopt(found, good)
         let_go()
         if ends(state.current):
-            return
-    if state.current.chi2_per_sample < FAR_FROM_NOISE:
-        backward(task, state, made_up)
-        exchange(task, state, check)
-        if commuted(task, state, scored.get("sensor_lag")):
-            exchange(task, state, check)
-    if state.steps and state.current is not state.steps[-1][0].result:
-        ends(state.current)
+            return task, made_up, True
+    return task, made_up, False
+
+
+def _best_of(trials):
+    """The trials that take enough for their parameters and are physical, and the best of them, or None."""
+    good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
+    return good, min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5), default=None)
+
+
+def _calm(state) -> bool:
+    """Whether the effects found meet the noise."""
+    return bool(state.steps) and state.current.chi2_per_sample < SILENT_CHI2
+
+
+def _takes_too_little(state, best, excess) -> bool:
+    """Whether a further effect leaves most of a misfit."""
+    return bool(state.steps) and best.drop < LEAST_SHARE * excess and state.current.chi2_per_sample > MISFIT
+
+
+def _makes_up_for_form(state, base, best) -> bool:
+    """Whether a further effect takes as little as the form of the laws of those found leaves."""
+    return best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best)
+
+
+def _not_confirmed(state, best, excess, check, unsure: bool) -> bool:
+    """Whether check recordings speak against a further effect, or not for one of which the recordings are `unsure`."""
+    further = state.steps and check and not _decides(state.current, best, excess)
+    if further and _predicts_worse(state.current, best.result, state.foretell):
+        return True
+    return unsure and best.drop + _confirmed(state.current, best.result, state.foretell) < SECOND_Z**2
+
+
+def _adopt_of(state, base, check):
+    """Adopt the best of the round under way, where there is one that it would not have refused."""
+    trials = list(state.under_way.values())
+    state.tried = {t.name: t.candidate for t in trials} | state.tried
+    good, best = _best_of(trials)
+    excess, unsure = max(excess_of(state.current), MIN_DROP), _calm(state)
+    if best is None or unsure and not state.foretell or _takes_too_little(state, best, excess) or _makes_up_for_form(state, base, best):
+        return
+    if not _not_confirmed(state, best, excess, check, unsure):
+        state.adopt(best, good)
 
 
 def _hopeless(current, leader, excess) -> bool:
@@ -184,16 +205,16 @@ def _hopeless(current, leader, excess) -> bool:
     return finest(current.choices) and current.chi2_per_sample > MISFIT and BEYOND_PROMISE * leader.z**2 < LEAST_SHARE * excess
 
 
-def _trials(task, current, top, candidates, excess, ended_so_far) -> list[Trial]:
+def _trials(task, current, top, candidates, excess, under_way) -> list[Trial]:
     """The leaders fitted beside the current fit, two side by side, until one meets the noise; then the family of the best.
-    `ended_so_far`: a dict that holds each trial by name as soon as it has ended."""
+    `under_way`: a dict that is given each trial by name as soon as it has ended."""
     trials = []
 
     def useful(*others):
         return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
 
     def kept(trial):
-        ended_so_far[trial.name] = trial
+        under_way[trial.name] = trial
         return trial
 
     def begun(c, target):

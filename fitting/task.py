@@ -17,32 +17,26 @@ def freed_beyond(result) -> tuple[str, ...]:
     return tuple(n for n in result.problem.layout.names if n not in result.bench.free)
 
 
+LATE = 0.6  # of the time, after which nothing is begun anew
+
+
 class Late(Exception):
-    """Raised by the next word of a search whose time is over."""
+    """Raised by a search whose time is over."""
 
 
 class Clock:
-    """When a search ends, `minutes` from now, or never; `cut`: whether it was ended before it was through."""
+    """When a search ends, `minutes` from now, or never, and from when on it begins nothing anew; `cut`: whether anything was left
+    out for want of time."""
 
     def __init__(self, minutes: float = np.inf):
-        self.end, self.cut = time.monotonic() + 60 * minutes, False
+        now = time.monotonic()
+        self.end, self.late, self.cut = now + 60 * minutes, now + LATE * 60 * minutes, False
 
-    @property
-    def over(self) -> bool:
-        """Whether the time is over."""
-        return time.monotonic() > self.end
-
-    def within(self, progress):
-        """The progress function that raises `Late` once the time is over."""
-
-        def say(*words):
-            if self.over:
-                self.cut = True
-                raise Late
-            if progress is not None:
-                progress(*words)
-
-        return say
+    def check(self, end: float):
+        """Raise `Late` after a time, `end` or `late`."""
+        if time.monotonic() > end:
+            self.cut = True
+            raise Late
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +49,25 @@ class Task:
     progress: Callable | None = None
     actuator: object = None
     clock: Clock = dataclasses.field(default_factory=Clock)
+    ends: float = np.inf  # time.monotonic() after which it raises `Late`
 
     @property
     def timed(self):
-        """The same, ended by its clock: at its next word a fit raises `Late`."""
-        return self.on(progress=self.clock.within(self.progress))
+        """The same, ended by its clock: what is to begin or goes on then raises `Late`."""
+        return self._until(self.clock.end)
+
+    @property
+    def sparing(self):
+        """The same, of what a diagnosis begins anew with: ended while there is time for the rest of it."""
+        return self._until(self.clock.late)
+
+    def _until(self, end):
+        def say(*words):
+            self.clock.check(end)
+            if self.progress is not None:
+                self.progress(*words)
+
+        return self.on(progress=say, ends=end)
 
     @property
     def held(self) -> tuple[str, ...]:
@@ -77,6 +85,7 @@ class Task:
 
     def fit(self, actuator=None, **more):
         """`fit` of an actuator, the given one if None, with all of its effects free; `more`: its further options. Ctrl-C is raised."""
+        self.clock.check(self.ends)
         actuator = self.actuator if actuator is None else actuator
         usual = {"extra": effect_parameters(actuator), "choices": self.choices, "progress": self.progress}
         return fit_or_stop(self.recordings, self.bench, actuator=actuator, **{**usual, **more})

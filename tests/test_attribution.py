@@ -832,6 +832,8 @@ def test_the_range_of_a_sensors_curve_stands_beside_its_size():
     assert {n: (p["value"], p["stderr"], p["unit"]) for n, p in sizes.items()} == {
         "q": (0.02, 0.001, "1"), "centre": (3e-6, 0.0, "m"), "half": (2e-5, 0.0, "m")
     }  # fmt: skip
+    at_bound = {"of_field": {"value": 1.0, "stderr": 0.0, "unit": "1"}}  # fitted
+    assert _size(at_bound) == "of_field = 1 ± 0"
     assert _size(sizes) == "q = 0.02 ± 0.001; centre = 3e−6 m (given); half = 2e−5 m (given)"
 
 

@@ -15,7 +15,7 @@ from fitting.diagnosis import Diagnosis
 from fitting.reach import beyond_text
 from fitting.report.tables import checks
 from fitting.setup import Choices
-from fitting.task import Task
+from fitting.task import Clock, Task
 from magjax.bench import load_bench
 from magjax.effects import AmplifierClipping
 from magjax.errors import ConfigurationError
@@ -92,17 +92,19 @@ def missed(*ratios, verdict="attributed", chi2=0.9, effects=("creep",), groups=(
 
 CHECKS = [recording(0.5, f"c{k}.csv") for k in range(3)]
 BOTH = ("creep", "amplifier_clipping")
+CUT = "a search that was ended"
 
 
-def with_missed(monkeypatch, found, again, check=CHECKS):
-    asked = []
+def with_missed(monkeypatch, found, again, check=CHECKS, clock=None):
+    asked, clock = [], clock or Clock()
 
     def diagnosed(task, left):
         asked.append(([r.name for r in task.recordings], [c.name for c in left]))
-        return again
+        clock.cut = again is CUT
+        return missed(1, 1.5, effects=BOTH) if again is CUT else again
 
     monkeypatch.setattr(module, "_diagnosed", diagnosed)
-    task = Task((recording(0.8, "fit.csv"),), load_bench("aa-050h"), Choices())
+    task = Task((recording(0.8, "fit.csv"),), load_bench("aa-050h"), Choices(), clock=clock)
     return module._with_missed_check(task, found, check), asked
 
 
@@ -132,6 +134,15 @@ def test_else_it_is_told(monkeypatch, again):
     assert len(asked) == 1 and [e["name"] for e in found.effects] == ["creep"]
     assert found.message.startswith("So. c1.csv is missed by 13 times its noise") and "record more like it" in found.message
     assert not any("joined" in r for r in found.check)
+
+
+@pytest.mark.parametrize(("minutes", "asks"), [(1e-9, 0), (np.inf, 1)], ids=["no time is left", "its search was ended"])
+def test_without_time_for_it_the_first_diagnosis_stands(monkeypatch, minutes, asks):
+    """A group whose rivals a second search had no time to fit would come out as a name."""
+    clock = Clock(minutes)
+    found, asked = with_missed(monkeypatch, missed(1, 13, 2), CUT, clock=clock)
+    assert len(asked) == asks and clock.cut and [e["name"] for e in found.effects] == ["creep"]
+    assert "there was no time" in found.message and "record more like it" not in found.message
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import fitting.learned as learned_module
 import fitting.own_signals as signals_module
 import fitting.rough as rough_module
 import fitting.search as search_module
+import fitting.task as task_module
 from fitting.attribute import Trial, chi2_of, rivals_of
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
@@ -25,7 +26,8 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices, spectra_of
 from fitting.spectra import line_deviations
-from fitting.task import Clock, Late, Task
+from fitting.task import Late, Task
+from fitting.verdict import dominant, verdict
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording
@@ -125,43 +127,76 @@ def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, 
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
     asked = {"sensor_lag", "amplifier_lag", "transport_delay", "duffing_stiffness"}
     choices = Choices(fine=250, without=tuple(e.name for e in CATALOGUE if e.name not in asked))
-    clock, family = Clock(1e-9 if ends == "at once" else np.inf), search_module.family
+    part = "leaders" if ends == "at once" else "family"  # too late for any effect, or for rivals alone
+    now, made = [0.0], getattr(search_module, part)
 
     def over(*arguments):
-        clock.end = 0.0
-        return family(*arguments)
+        now[0] = 151.0
+        return made(*arguments)
 
-    monkeypatch.setattr(module, "Clock", lambda minutes: clock)
-    monkeypatch.setattr(search_module, "family", over)
+    monkeypatch.setattr(task_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(search_module, part, over)
     found = diagnose(runs, bench, check=checks, choices=choices, minutes=2.5)
-    assert clock.cut and found.verdict == said and [e["name"] for e in found.effects] == named
-    assert "ended after 2.5 minutes" in found.message and found.as_dict()["ended_after"] == 2.5
+    assert found.verdict == said and [e["name"] for e in found.effects] == named
+    assert "cut short by its limit of 2.5 min" in found.message and found.as_dict()["ended_after"] == 2.5
     assert found.base.converged and (found.repaired is not None) == bool(named)
 
 
 @pytest.mark.parametrize(
     ("taken", "left", "adopted"),
-    [(800.0, 1.0, ["creep", "backlash"]), (20.0, 12.8, ["creep"]), (100.0, 12.0, ["creep"])],
-    ids=["much", "less than an effect must", "a little of a misfit"],
+    [(1200.0, 1.0, ["creep", "backlash"]), (20.0, 12.8, ["creep"]), (100.0, 12.0, ["creep"]), (400.0, 9.0, ["creep"])],
+    ids=["all of it", "next to nothing", "a little of a misfit", "as little as the form of the first leaves"],
 )
 def test_of_a_round_that_was_ended_the_best_trial_is_kept_where_a_full_round_would_keep_it(monkeypatch, taken, left, adopted):
-    plain, first, second = a_fit(30.0, 58.0), a_fit(13.0, 60.0, "creep"), a_fit(left, 62.0, "creep", "backlash")
-    rounds = iter([[trial("creep", first, 1700.0)], None])
+    plain, first, second = a_fit(1e3, 58.0), a_fit(13.0, 60.0, "creep"), a_fit(left, 62.0, "creep", "backlash")
+    rounds = iter([[trial("creep", first, 98700.0)], None])
 
-    def trials(task, current, top, candidates, excess, so_far):
+    def trials(task, current, top, candidates, excess, under_way):
         if ended := next(rounds):
             return ended
-        so_far["backlash"] = trial("backlash", second, taken)
+        under_way["backlash"] = trial("backlash", second, taken)
         raise Late
 
-    for name, made in {
-        "leaders": lambda candidates: candidates, "_trials": trials, "screened": lambda *a: [scored("backlash", 20.0)],
-        "_finer": lambda task, now, best, good, *a: (best, good, task), "_of_two": lambda task, best, left, good: (best, left),
-    }.items():  # fmt: skip
-        monkeypatch.setattr(search_module, name, made)
+    alone(monkeypatch, _trials=trials)
     reached = search_module.search(Task((), None), plain, [scored("creep", 40.0)])
-    assert [best.name for best, *_ in reached.steps] == adopted
+    assert reached.ended and [best.name for best, *_ in reached.steps] == adopted and set(reached.tried) == {"creep", "backlash"}
     assert reached.current is (second if len(adopted) > 1 else first)
+
+
+def alone(monkeypatch, **made):
+    """The rounds of a search by themselves, with what is `made` in place of its parts."""
+    usual = {
+        "leaders": lambda candidates: candidates, "screened": lambda *a: [scored("backlash", 20.0)], "_predicts_worse": lambda *a: False,
+        "_finer": lambda task, now, best, good, *a: (best, good, task), "_of_two": lambda task, best, left, good: (best, left),
+    }  # fmt: skip
+    for name, function in {**usual, **made}.items():
+        monkeypatch.setattr(search_module, name, function)
+
+
+def test_what_a_round_has_refused_is_not_adopted_when_the_time_is_over_later(monkeypatch):
+    plain, first, form = a_fit(1e3, 58.0), a_fit(3.0, 60.0, "creep"), a_fit(2.0, 62.0, "creep", "backlash")
+    rounds = iter([[trial("creep", first, 99700.0)], [trial("backlash", form, 100.0)]])
+
+    def late(*_):
+        raise Late
+
+    alone(monkeypatch, _trials=lambda *a: next(rounds), backward=late)
+    reached = search_module.search(Task((), None), plain, [scored("creep", 40.0)], check=("one",))
+    assert reached.ended and [best.name for best, *_ in reached.steps] == ["creep"] and reached.form == "backlash"
+    assert reached.current is form
+
+
+@pytest.mark.parametrize(("chi2", "said"), [(5.0, "of those that were fitted by then"), (1.0, "what scores was not all fitted")])
+def test_a_verdict_after_the_time_is_over_claims_nothing_of_what_was_not_fitted(bench, chi2, said):
+    plain = a_fit(chi2, 58.0)
+    evidence = dataclasses.replace(evidence_of([], plain, plain, (scored("creep", 40.0),), {}), bench=bench)
+    evidence = dataclasses.replace(evidence, where={"by_block": {"coil": 1.0}, "by_field": [1.0, 0.0]})
+    assert said in verdict(evidence.cut_short()).message and said not in verdict(evidence).message
+    alone = a_fit(1.4, 60.0, "creep")
+    step = trial("creep", alone, 1360.0)
+    others = {n: trial(n, a_fit(9.0, 60.0), 600.0).candidate for n in ("creep", "backlash")}
+    found = evidence_of([(step, [step], [step], a_fit(15.0, 58.0))], a_fit(15.0, 58.0), alone, (), others)
+    assert dominant(found) and not dominant(found.cut_short())
 
 
 def scored(name, z, visibility=0.1, **achieved):

@@ -53,7 +53,11 @@ def still_left(found) -> str:
 
 
 def headline(found) -> str:
-    """The verdict in plain words."""
+    """The verdict in plain words, and whether the search was ended."""
+    return _headline(found) + (" (the search was cut short by its limit of time)" if found.get("ended_after") else "")
+
+
+def _headline(found) -> str:
     verdict = found["verdict"]
     if verdict == "attributed":
         names = " and ".join(f"{words(e['name'])} ({e['block']})" for e in found["effects"])
@@ -65,6 +69,8 @@ def headline(found) -> str:
         return f"Something is missing, and these recordings cannot say which: {names}{found_beside}"
     if verdict == "nothing_missing" and (left := still_left(found)):
         return f"No effect {_asked(found)} was found{_judged(found)}; {left}"
+    if verdict == "nothing_missing" and found.get("ended_after"):
+        return f"No effect {_asked(found)} was found"
     if verdict == "unknown_at":
         where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
         return f"Something is missing that no effect {_asked(found)} explains; it acts most like the block {where}"

@@ -105,8 +105,8 @@ def _size(parameters) -> str:
     """Parameters with their errors; what was given has none."""
 
     def one(p):
-        if p["stderr"] == 0:
-            return f"{plain(p['value'], 4)} {unit_text(p['unit'])} (given)"
+        if p.get("given"):
+            return " ".join(filter(None, (plain(p["value"], 4), unit_text(p["unit"]), "(given)")))
         return f"{tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'])}".strip()
 
     return "; ".join(f"{n} = {one(p)}" for n, p in parameters.items())

@@ -197,7 +197,7 @@ def judge(content: dict, source: dict | None) -> dict:
         "verdict": verdict,
         "effects": effects,
         "groups": content["groups"],
-        "settled": verdict in SETTLED and foretold,
+        "settled": verdict in SETTLED and foretold and content.get("ended_after") is None,
         "message": message,
     }
 

@@ -5,6 +5,7 @@ import shlex
 import sys
 
 from .acquire import _record_options, campaign
+from .fit import MINUTES
 from .runtime import parser, prepare_jax
 
 STATUS = {"settled": 0, "interrupted": 130, "device": 5, "no usable recording": 3}
@@ -67,7 +68,7 @@ def analysis(bench, folder, options, live):
             if errors:
                 raise errors[0]
             held, refused = load_checks(checks, bench)
-            found = diagnose(recordings, bench, check=held, progress=progress, minutes=options.minutes).without_checks(refused)
+            found = diagnose(recordings, bench, check=held, progress=progress, minutes=MINUTES).without_checks(refused)
         except RecordingError as error:
             found, shown = unusable(errors or [error], recordings if errors else ()), error.shown
         content = found.as_dict()

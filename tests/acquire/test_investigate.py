@@ -133,6 +133,7 @@ def test_who_decided_and_what_both_say_together():
     assert said["verdict"] == "attributed" and said["settled"] and "amplifier_lag was decided by r1.mjlog" in said["message"]
     badly = judge({**content, "check": [{"noise_rms": 1.0, "rms_after": 9.0}]}, None)
     assert not badly["settled"]
+    assert judge(content, None)["settled"] and not judge({**content, "ended_after": 15.0}, None)["settled"]
 
 
 @pytest.mark.long
