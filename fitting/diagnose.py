@@ -48,7 +48,7 @@ MISSED = 5.0  # times its noise, by which a check recording is not foretold thou
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
-LATE_TEXT = "The search was cut short by its limit of {:g} min (--minutes); with more time it may find more, or rivals to what it names."
+LATE_TEXT = "The search was cut short by its limit of {:g} min (--minutes of magjax diagnose); with more time it may find more, or rivals to what it names."
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 

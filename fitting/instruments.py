@@ -184,15 +184,16 @@ def mode_as_filter(f0: float, xi: float) -> tuple[float, float]:
     return float(xi / (np.pi * f0)), float(0.25 / xi**2)
 
 
-def exchange(result, bench) -> tuple[str, bool] | None:
+def exchange(result, bench, form: str | None = None) -> tuple[str, bool] | None:
     """Whether the sensor's fitted filter and the rod's resonance could change places: (a sentence, whether they likely have).
 
     Linear filters commute: 1/(1 + s tau + order2 (s tau)^2) in the sensor behind a mode f0, xi reads the same as the mode's
     filter in the sensor behind a rod that resonates as the sensor's did. None where something tells them apart: a stated
     prior of f0, xi or the filter, a first-order filter, or mechanics that are not linear. A "sensor" that rings (damping
-    below one half, as no instrument's filter does) is likely the rod.
+    below one half, as no instrument's filter does) is likely the rod. `form`: an effect that only makes up for the form of
+    the others' laws.
     """
-    held = {e.name for e in result.actuator.effects}
+    held = {e.name for e in result.actuator.effects} - {form}
     names = {e.name for e in result.estimates if e.free}
     mode, filtered = ("mechanics.f0", "mechanics.xi"), ("effects.sensor_lag.tau", "effects.sensor_lag.order2")
     if not {*mode, *filtered} <= names or {*mode, *filtered} & set(bench.priors) or held & NOT_LINEAR:

@@ -89,7 +89,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     effects, groups, sizes, rivals = found_rows(evidence)
     if not effects and not groups:
         return _silent(evidence, common, dropped, rough)
-    swap = exchange(current, evidence.bench)
+    swap = exchange(current, evidence.bench, evidence.reached.form)
     if swap and swap[1] and not any("sensor_lag" in g for g in groups):
         effects = [e for e in effects if e["name"] != "sensor_lag"]
         groups.append(["sensor_lag", "second_mode"])

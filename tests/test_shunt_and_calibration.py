@@ -140,5 +140,7 @@ def test_a_filter_that_could_change_places_with_the_rod_is_told():
     assert not ringing and "right way round" in text
     assert exchange(fitted(405.0, 0.8, 1e-4, 0.0), bench) is None  # of first order: nothing to exchange
     assert exchange(fitted(405.0, 0.8, 1e-4, 0.5, ("sensor_lag", "delta_e")), bench) is None
+    bent = fitted(405.0, 0.8, 1e-4, 1.4, ("sensor_lag", "sensor_nonlinearity"))
+    assert exchange(bent, bench) is None and exchange(bent, bench, form="sensor_nonlinearity")[1]  # that one only mends a form
     known = dataclasses.replace(bench, priors={"mechanics.f0": 20.0})
     assert exchange(fitted(405.0, 0.8, 1e-4, 0.5), known) is None

@@ -247,7 +247,7 @@ class Campaign:
     def one(self, entry: Entry) -> dict:
         """One entry: recorded until it passes its check, `tries` times at most; a recording that is there and good is kept.
 
-        What is in the way is put aside as .bad or, where it holds another drive, as .other.
+        What is in the way is put aside as NAME.mjlog.bad0 or, where it holds another drive, as NAME.mjlog.other0.
         """
         path = self.folder / f"{entry.name}.mjlog"
         if path.exists() and not self._another(path, entry) and not self.problems(path, entry):
@@ -256,8 +256,8 @@ class Campaign:
         for attempt in range(1, self.settings["tries"] + 1):
             if path.exists():
                 why = "other" if self._another(path, entry) else "bad"
-                count = len(list(self.folder.glob(f"{glob.escape(entry.name)}.{why}*")))
-                path.rename(self.folder / f"{entry.name}.{why}{count}.mjlog")
+                count = len(list(self.folder.glob(f"{glob.escape(path.name)}.{why}*")))
+                path.rename(self.folder / f"{path.name}.{why}{count}")  # no *.mjlog finds it
             order = Order(
                 self.port, str(path), entry.rate, entry.samples, settle, entry.drive, self.baud, self.limit, durable=self.durable,
                 give_up_s=self.give_up_s, amplifier=self.amplifier, demagnetize=bool(self.settings["demagnetize"]), header=self.header,

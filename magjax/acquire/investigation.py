@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from ..errors import ConfigurationError
-from .campaign import Campaign, Entry, Plan, entries, sine_entry
+from .campaign import FEWEST, Campaign, Entry, Plan, entries, sine_entry
 from .source_check import check_source
 
 SETTLED = ("attributed", "nothing_missing")
@@ -95,9 +95,15 @@ class Investigation:
         if self.plan is not None:
             first = entries(self.plan, rate)
         else:
-            first = [self._entry(f, a * self._limit, o * self._limit, f"{k:03d}") for k, (f, a, o) in enumerate(STUDY)]
-        checks = [self._entry(f, a * self._limit, o * self._limit, f"check{k}") for k, (f, a, o) in enumerate(CHECKS)]
+            first = [self._entry(*drive, f"{k:03d}") for k, drive in enumerate(self._drives(STUDY))]
+        checks = [self._entry(*drive, f"check{k}") for k, drive in enumerate(self._drives(CHECKS))]
         return [e for e in first if e.frequency], checks
+
+    def _drives(self, usual):
+        """(Hz, A, A) of the usual drives, their frequencies lowered by one factor where the device does not sample the fastest."""
+        fastest = FEWEST * max(f for f, *_ in (*STUDY, *CHECKS))
+        share = min(1.0, (1 - 1e-9) * self.rate_max / fastest)  # a hair less: that many samples a period must fit
+        return [(f * share, a * self._limit, o * self._limit) for f, a, o in usual]
 
     @property
     def _limit(self) -> float:
@@ -140,13 +146,13 @@ class Investigation:
         menu = [(asked["frequency_Hz"], asked["amplitude"], asked["offset"])] if asked else []
         menu += [(f, a * self._limit, o * self._limit) for f, a, o in FURTHER]
         done = [(d[0], d[1], d[2]) for d in self.state["extra"]]
-        done += [(f, a * self._limit, o * self._limit) for f, a, o in STUDY] if self.plan is None else []
+        done += self._drives(STUDY) if self.plan is None else []
         for f, a, o in menu:
             a = min(a, self._limit - abs(o))
             near = any(
                 abs(f / g - 1) < 0.02 and abs(a - b) < 0.05 * self._limit and abs(o - c) < 0.05 * self._limit for g, b, c in done
             )
-            if a > 0 and not near and f * 40 <= self.rate_max:
+            if a > 0 and not near and f * FEWEST <= self.rate_max:
                 return [float(f), float(round(a, 4)), float(round(o, 4))]
         return None
 

@@ -69,7 +69,7 @@ def implicit_euler(plant: PlainActuator, current, h: float, operator=None):
 def second_mode_force(plant: PlainActuator, displacement, h: float):
     """The free displacement that makes both modes together follow `displacement`, over the whole trajectory at once.
 
-    U = Y / (G + gain (G2 - G)) on a padded FFT: at rest before, and smoothly on (point-mirrored) after the end.
+    U = Y / (G + gain (G2 - G + lead (s / w2) (G2 - (w2 / w0)^2 G))) on a padded FFT: at rest before, and smoothly on (point-mirrored) after the end.
     """
     mode = plant.effects["second_mode"]
     y = np.asarray(displacement, float)
@@ -82,8 +82,19 @@ def second_mode_force(plant: PlainActuator, displacement, h: float):
     first = w**2 / (s * s + 2 * plant.xi * w * s + w**2)
     second = w2**2 / (s * s + 2 * mode["xi2"] * w2 * s + w2**2)
     quiet = np.abs(s) < 2 * np.pi * 20 * max(plant.f0, mode["f2"])  # beyond, differentiating twice only lifts rounding
-    U = np.where(quiet, np.fft.rfft(whole) / (first + mode["gain"] * (second - first)), 0.0)
+    beside = second - first + mode.get("lead", 0.0) * s / w2 * (second - (w2 / w) ** 2 * first)
+    U = np.where(quiet, np.fft.rfft(whole) / (first + mode["gain"] * beside), 0.0)
     return np.fft.irfft(U, len(whole))[pad : pad + len(y)]
+
+
+def with_second_mode(plant, rod, second) -> float:
+    """The displacement, m, of the states [y, dy/dt] of both modes under one force; that of the first where the plant has no other."""
+    mode = plant.effects.get("second_mode")
+    if mode is None:
+        return rod[0]
+    w, w2 = 2 * np.pi * plant.f0, 2 * np.pi * mode["f2"]
+    of_rate = second[1] / w2 - w2 / w**2 * rod[1]
+    return rod[0] + mode["gain"] * (second[0] - rod[0] + mode.get("lead", 0.0) * of_rate)
 
 
 def free_displacement(plant, displacement, h: float):
@@ -133,7 +144,7 @@ def nearest_feasible(plant: PlainActuator, displacement, h: float):
         if k:
             rod = oscillate(rod, free[k - 1], after, h, plant.f0, plant.xi)
             second = second if mode is None else oscillate(second, free[k - 1], after, h, mode["f2"], mode["xi2"])
-        reached.append(rod[0] + (0.0 if mode is None else mode["gain"] * (second[0] - rod[0])))
+        reached.append(with_second_mode(plant, rod, second))
     return np.array(reached)
 
 
@@ -177,8 +188,10 @@ def current_for_displacement(plant: PlainActuator, displacement, h: float, of_re
     current = rate / plant.c1 + (H - plant.H_bias) / plant.c0
     if "excess_loss" in plant.effects:
         e = plant.effects["excess_loss"]
-        flux_rate = MU0 * rate
-        current = current + e["k"] * flux_rate / (flux_rate**2 + e["rate_knee"] ** 2 + 1e-12) ** 0.25 / plant.c0
+        flux_rate, knee = MU0 * rate, e["rate_knee"] + 1e-6
+        root = 1 / (flux_rate**2 + e["rate_knee"] ** 2 + 1e-12) ** 0.25
+        walls = 2 / (knee**0.5 + (knee + 4 * np.abs(flux_rate)) ** 0.5)
+        current = current + e["k"] * flux_rate * (root + e.get("full", 0.0) * (walls - root)) / plant.c0
     if "amplifier_lag" in plant.effects:
         lag = plant.effects["amplifier_lag"]
         change = lag["tau"] * np.diff(current, prepend=current[0]) / h

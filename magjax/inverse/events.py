@@ -10,7 +10,7 @@ every event is in closed form, and the last x takes a monotone Newton iteration 
 import math
 
 from ..errors import ConfigurationError
-from .dynamic import PlainActuator
+from .dynamic import PlainActuator, with_second_mode
 
 PLANT_EFFECTS = ("amplifier_lag", "quartic_magnetostriction", "second_mode")
 
@@ -40,8 +40,7 @@ class HeldCurrent:
     @property
     def displacement(self) -> float:
         """Displacement, m."""
-        mode = self.plant.effects.get("second_mode")
-        return self.rod[0] if mode is None else self.rod[0] + mode["gain"] * (self.second[0] - self.rod[0])
+        return with_second_mode(self.plant, self.rod, self.second)
 
     @property
     def speed(self) -> float:

@@ -181,7 +181,7 @@ class Dask:
         try:
             import distributed
         except ImportError:
-            raise ConfigurationError('a dask scheduler needs dask.distributed; type pip install "magjax[scale]"') from None
+            raise ConfigurationError('a dask scheduler needs dask.distributed; type pip install -e ".[scale]"') from None
         self.library, self.where, self.lost = distributed, where, 0
 
     def run(self, name, work, inputs, tasks):

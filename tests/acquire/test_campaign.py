@@ -74,7 +74,7 @@ def test_a_bad_recording_is_repeated(emulate, study, tmp_path):
     made = Campaign(port, load_bench("aa-050h"), tmp_path, 0.9, {**SETTINGS, **read_plan(study).settings}, {}, say=said.append)
     (row,) = made.run(entries(read_plan(study))[1:2])
     assert row["status"] == 0 and row["tries"] == 2 and "reset" in " ".join(said)
-    assert len(list(tmp_path.glob("*.bad0.mjlog"))) == 1
+    assert len(list(tmp_path.glob("*.mjlog.bad0"))) == 1
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_a_changed_plan_is_recorded_anew(emulate, study, tmp_path):
     assert (row()["tries"], row()["tries"]) == (1, 0)
     study.write_text(STUDY.replace("amplitude = 0.4", "amplitude = 0.41"))
     assert (row()["tries"], row()["tries"]) == (1, 0)
-    assert len(list(tmp_path.glob("*.other0.mjlog"))) == 1 and not list(tmp_path.glob("*.bad*"))
+    assert len(list(tmp_path.glob("*.mjlog.other0"))) == 1 and not list(tmp_path.glob("*.bad*"))
 
 
 def test_what_the_device_cannot_do_is_refused_before_anything_moves(emulate, study, tmp_path, capsys):
