@@ -63,13 +63,16 @@ def diagnose(
     progress=None,
     minutes: float = np.inf,
 ) -> Diagnosis:
-    """Diagnose recordings against a bench; `check`: recordings that take no part in any fit.
+    """Diagnose recordings (`Recording`s of drives that repeat) against a bench; `check`: recordings that take no part in any fit;
+    `actuator`: what the plain model starts from, with effects that belong to it, None for the bench's constants; `choices`: how
+    fits are set up, and the effects that alone are asked for.
 
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
     reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
     `minutes`: after them, from the beginning, the search for effects ends with what it has found; the plain fit before it is
-    waited for.
-    Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all.
+    waited for, and from three fifths of the time on nothing is begun anew. `ended_after` of the diagnosis tells.
+    Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all and `ConfigurationError` for a wrong
+    bench.
     """
     bench = load_bench(bench)
     recordings, check = list(recordings), list(check)

@@ -50,12 +50,13 @@ def fit(
 ) -> FitResult:
     """Fit an actuator to recordings jointly.
 
-    `bench`: a `Bench` or its name; `actuator`: start (the bench's constants if None), effects included; `extra`: names
-    of further free parameters; `refine`: let a finer density be chosen where the misfit asks for it, or up to what chi2/N;
+    `recordings`: `Recording`s of drives that repeat; `bench`: a `Bench` or its name; `actuator`: start (the bench's constants
+    if None), effects included; `extra`: names of further free parameters; `choices`: density, grids and limits; `refine`:
+    let a finer density be chosen where the misfit asks for it, or up to what chi2/N.
     Masses that `bench.free` does not name are held at those of `actuator`, with its start memory.
-    `progress`: called as progress(text, step, chi2 per datum); `target`: a chi2 above which the fit is of no use and may end early;
-    `spectra`: those of the recordings, where another fit of the same has them; `start`: a fit whose density and weights are
-    gone on from.
+    `progress`: called as progress(text, step, chi2 per datum); `target`: a total chi2 above which the fit is of no use and may
+    end early; `spectra`: those of the recordings, where another fit of the same has them; `start`: a fit whose density and
+    weights are gone on from.
     Returns a `FitResult`; raises `RecordingError` where a recording cannot be used and `ConfigurationError` for a wrong
     bench. Non-convergence is a result, not an exception.
     """
@@ -211,7 +212,8 @@ _actuator_at = eqx.filter_jit(lambda layout, template, z: layout.actuator(templa
 
 
 def finish(problem, solution, choices, bench, recordings, warm=0.0, target=np.inf) -> FitResult:
-    """Per-recording misfit and the outcome; what is quoted, of a fit that missed its `target` too, waits until it is asked for."""
+    """Per-recording misfit and the outcome; what is quoted, of a fit that missed its `target` (total chi2) too, waits until it is
+    asked for. `warm`: s spent on compiling."""
     fitted = _actuator_at(problem.layout, problem.template, jnp.asarray(solution.z))
     count = problem.data_count
     residual = data_residual(problem, solution.z)

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from magjax.errors import ConfigurationError
+
 from .uncertainty import visited_cells
 
 
 @dataclasses.dataclass(frozen=True)
 class RecordingFit:
-    """How one recording was met; rms in the unit of its channel."""
+    """How one recording was met; `frequency` of its drive, Hz; rms of what repeats, and noise of one sample, in the unit of its channel."""
 
     file: str
     sha256: str
@@ -39,7 +41,8 @@ class Quoted:
 
 @dataclasses.dataclass(frozen=True)
 class FitResult:
-    """A fitted actuator with what is known about it. `chi2_per_sample`: misfit per harmonic over its noise.
+    """A fitted actuator with what is known about it. `chi2_per_sample`: misfit per number of its harmonics (`data_count`) over
+    their noise; `unknowns`: as many as the data settle; `compile_s`, `solve_s`: s.
 
     `quote` makes the `Quoted`: most fits of a diagnosis are never asked for theirs, which take Jacobians of their own.
     """
@@ -88,8 +91,11 @@ class FitResult:
         return self.quoted.message
 
     def estimate(self, name: str):
-        """The estimate of one parameter by name."""
-        return next(e for e in self.estimates if e.name == name)
+        """The estimate of one parameter by name; raises `ConfigurationError` where it has no such."""
+        found = next((e for e in self.estimates if e.name == name), None)
+        if found is None:
+            raise ConfigurationError(f'the fit has no parameter "{name}"; it has {", ".join(e.name for e in self.estimates)}')
+        return found
 
     @property
     def cells(self) -> dict:

@@ -40,7 +40,7 @@ def test_it_runs(source, tmp_path):
 @EACH
 def test_its_cells_are_those_of_the_source(source):
     """`python notebooks/build.py NN` was run after the last change."""
-    jupytext = pytest.importorskip("jupytext", reason="wants the notebooks' packages: pip install 'magjax[notebooks]'")
+    jupytext = pytest.importorskip("jupytext", reason="wants the notebooks' packages: pip install -e '.[notebooks]'")
     of_source = [(c.cell_type, c.source) for c in jupytext.read(source).cells]
     of_notebook = [(c["cell_type"], "".join(c["source"])) for c in stored(source)]
     for k, pair in enumerate(zip(of_source, of_notebook, strict=True)):

@@ -47,7 +47,7 @@ def design_summary(plant, options, folder) -> dict:
     if margins.delay == 0:
         warning += " One extra sample of delay destabilizes the loop."
     summary["message"] = (
-        f"gamma* = {made.gamma:.6g} um (certified within {made.gap:.1e}); control at most {made.control:.4g} M_s^2; controller of "
+        f"gamma* = {made.gamma:.6g} um (certified to a relative gap of {made.gap:.1e}); control at most {made.control:.4g} M_s^2; controller of "
         f"order {controller.order} on its model; {margins}.{warning}"
     )
     if folder is not None:

@@ -1,7 +1,7 @@
 """What an effect is: one piece of physics in one block that T&B leave out.
 
-At its null the extended model is bit-identical to the base: write laws in increment form, x + k * (...). An effect
-overrides the hooks of its block only; all others are identities. Adding one is one new file and one line in CATALOGUE.
+At its null the extended model is the base but for rounding (2e-15 relative): write laws in increment form, x + k * (...). An effect
+overrides the hooks of its block only; all others are identities. Adding one is one new file and two lines in `__init__.py`.
 
 hook            block                   acts on
 drive           source                  the current on its way to the coil (whole signal)

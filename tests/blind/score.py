@@ -31,7 +31,7 @@ def wilson(right: int, total: int, z: float = 1.96):
         return 0.0, 1.0
     p = right / total
     centre, spread = p + z * z / (2 * total), z * np.sqrt(p * (1 - p) / total + z * z / (4 * total**2))
-    return (centre - spread) / (1 + z * z / total), (centre + spread) / (1 + z * z / total)
+    return max(centre - spread, 0.0) / (1 + z * z / total), (centre + spread) / (1 + z * z / total)
 
 
 def kin(name: str) -> set:

@@ -6,7 +6,7 @@ import pytest
 
 from .conftest import KINDS
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install magjax[test]")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[test]'")
 CHROMIUM = next(
     (p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")) if p), None
 )

@@ -48,8 +48,8 @@ SETTINGS = {
     "limits.current_A": "largest current, A: bounds the Preisach plane of `simulate` (by 0.9 where none is stated), what `record` may drive and what is asked for next",
     "limits.field_A_per_m": "the same for a bench that is driven by a field, A/m (300 where none is stated)",
     "limits.voltage_V": "the same for a piezo stack, V (150 where none is stated)",
-    "fit.free": 'what a fit frees: "hysteresis.masses" and any "block.parameter" of the tables above',
-    "fit.output": "the measured quantity that is fitted (default: displacement, or flux_density without [magnetostriction] and [piezo])",
+    "fit.free": 'what a fit frees: "hysteresis.masses" and any "block.parameter" of the tables above (default: the masses and what of R_eddy, k_eddy, chi, xi and f0 the bench has)',
+    "fit.output": "what is fitted: displacement, flux_density, magnetization, polarization or strain (default: displacement, or flux_density without [magnetostriction] and [piezo])",
     "fit.priors": "standard deviation of a free parameter about its stated value, SI, above zero, by its full name, as in `coil.R_eddy = 2.0`",
 }
 COLUMNS = {
