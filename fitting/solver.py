@@ -132,9 +132,12 @@ class SteppedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags):
         prior, residual, cost, damping = options["prior"], state.residual, state.cost, state.damping
         J = options["jacobian"](y)
-        information = J.T @ J
-        normal, gradient = information + prior, J.T @ residual + prior @ y
-        good, new = False, None
+        with np.errstate(over="ignore", invalid="ignore"):
+            information, gradient = J.T @ J, J.T @ residual + prior @ y
+        if not (np.isfinite(information).all() and np.isfinite(gradient).all()):  # from a start beyond all reason no step leads back
+            none = np.zeros_like(prior), np.zeros_like(y)
+            return y, SteppedState(damping, cost, residual, *none, np.inf, 0.0, False), None
+        normal, good, new = information + prior, False, None
         for _ in range(self.trials):
             new, predicted = damped_step(normal, gradient, y, damping, self.bounds, new)
             trial = fn(new, args)[0]

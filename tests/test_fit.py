@@ -429,6 +429,18 @@ def test_steps_asked_for_one_by_one_end_where_optimistix_ends():
     assert steps < 20 and y == pytest.approx(np.asarray(other.value), abs=1e-6) and list(y[1:]) == [0.0, 2.5]
 
 
+@pytest.mark.parametrize("slope", [1e200, np.inf, np.nan])
+def test_from_a_start_beyond_all_reason_no_step_is_taken_and_nothing_warns(slope):
+    """A trial whose effect began there: the square of its Jacobian overflows."""
+    solver, tags = SteppedLevenbergMarquardt((np.full(2, -np.inf), np.full(2, np.inf))), frozenset()
+    residual = lambda y, args: (np.asarray([1e100, 1.0, 1.0]), None)
+    options = {"jacobian": lambda y: np.asarray([[slope, 1.0], [0.0, 1.0], [1.0, 2.0]]), "prior": np.eye(2)}
+    state = solver.init(residual, np.ones(2), None, options, None, None, tags)
+    y, state, _ = solver.step(residual, np.ones(2), None, options, state, tags)
+    assert list(y) == [1.0, 1.0] and not state.good and state.decrement == np.inf
+    assert np.isfinite(state.information + options["prior"]).all()
+
+
 def test_solver_behind_optimistix_bears_hundreds_of_unknowns():
     """As `scipy.optimize.nnls` ends; with a call back to NumPy in the step this waited forever."""
     rng = np.random.default_rng(0)
