@@ -48,7 +48,7 @@ MISSED = 5.0  # times its noise, by which a check recording is not foretold thou
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
-LATE_TEXT = "The search was cut short by its limit of {:g} min (--minutes of magjax diagnose); with more time it may find more, or rivals to what it names."
+LATE_TEXT = "The limit of {:g} min (--minutes of magjax diagnose) left out what was still to be tried; with more time it may find more, or rivals to what it names."
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -223,19 +223,16 @@ def _concluded(task, evidence) -> Diagnosis:
     """The verdict; where no effect explains the misfit, a rough density's or with a function learned in its place. Once the time is
     over, without what takes another fit."""
     evidence = without_chance(evidence)
-    try:
-        return _thorough(task.timed, evidence)
-    except Late:
-        evidence = evidence.cut_short()
     found = verdict(evidence)
+    with contextlib.suppress(Late):
+        return _thorough(task.timed, evidence, found)
     if found.verdict == "unknown_at":
         return verdict(evidence, rough=True) if is_rough(evidence, found.check) else without_worse(evidence, found)
     return found
 
 
-def _thorough(task, evidence) -> Diagnosis:
-    """The verdict, with the fits that may change it."""
-    found = verdict(evidence)
+def _thorough(task, evidence, found) -> Diagnosis:
+    """What fits make of a verdict."""
     if rough := found.verdict == "unknown_at" and is_rough(evidence, found.check):
         found = verdict(evidence, rough=True)
     elif found.verdict in ("unknown_at", "attributed", "group") and (rougher := on_cells_alone(task, evidence)):

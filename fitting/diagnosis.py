@@ -112,10 +112,6 @@ class Evidence:
             self.experiments[key] = rivals, next_experiment(rivals, self.raw.spectra, self.bench, also)
         return self.experiments[key][1]
 
-    def cut_short(self) -> "Evidence":
-        """The same, for want of time."""
-        return dataclasses.replace(self, reached=dataclasses.replace(self.reached, ended=True))
-
     @property
     def excess(self) -> float:
         """chi2/N of what was reached."""

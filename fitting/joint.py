@@ -202,6 +202,8 @@ def solve(
             if progress is not None:
                 progress(taken, chi2 / count)
             path.append(chi2)
+            if not (state.good or np.isfinite(state.decrement)):  # it began beyond all reason
+                break
             far = chi2 / count > FAR
             missed = taken > 3 and chi2 - 8 * state.decrement > target or _too_slow(path, max_jacobians - taken, target)
             stuck = far and len(path) > STALLED and chi2 > (1 - STALL) * path[-STALLED]

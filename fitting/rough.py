@@ -71,7 +71,8 @@ def is_rough(evidence, checks) -> bool:
     steps, current = evidence.reached.steps, evidence.reached.current
     told = finest(evidence.plain.choices)
     if not steps:
-        return evidence.excess < (FINEST_BELOW if told else VERY_ROUGH_CHI2) and _tells_nothing(evidence)
+        nothing = not evidence.reached.partial and _tells_nothing(evidence)
+        return nothing and evidence.excess < (FINEST_BELOW if told else VERY_ROUGH_CHI2)
     if not evidence.excess < (REFINE_BELOW if told else ROUGH_CHI2):
         return False
     if too_little(evidence.reached, evidence.plain):
@@ -147,7 +148,7 @@ def beside_cells(task, evidence) -> Evidence | None:
     worth = {t.name for t in good if t.drop > HALF * first.drop and t.name not in LIKE_DENSITY}
     candidates = screened(cells, task.choices)
     reached = search(task, cells, [c for c in candidates if c.name in worth], evidence.checks[1])
-    if reached.ended or not reached.steps or not reached.current.chi2_per_sample < CELLS_LEAVE or reached.form:
+    if reached.late or not reached.steps or not reached.current.chi2_per_sample < CELLS_LEAVE or reached.form:
         return None
     if len(reached.steps) == 1:  # of rivals those that leave nothing that scores
         _, tied, good, _ = reached.steps[0]

@@ -11,6 +11,7 @@ from .attribute import UNCONFIRMED_TIE, chi2_of, confidence, tie_of
 CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
 DRIFTS = ("zero_drift", "thermal_drift")
 SLOW = ("creep", "magnetic_aftereffect")  # effects that go on for longer than a recording
+PARTIAL = 0.5  # most confidence in an effect of which not all rivals were fitted
 BEHIND = 5.0  # decades of a creep, that a mean may lack of its end
 
 
@@ -54,7 +55,9 @@ def found_rows(evidence):
             sizes |= {t.name: sizes_of(t.name, evidence.reached.current if t is best else t.result) for t in rivals}
             last = rivals
         else:
-            effects.append(_effect_row(best, good, evidence.raw, evidence.reached.current))
+            row = _effect_row(best, good, evidence.raw, evidence.reached.current)
+            unsure = evidence.reached.partial and best is evidence.reached.steps[-1][0]
+            effects.append({**row, "confidence": min(row["confidence"], PARTIAL)} if unsure else row)
     alone = {e["name"] for e in effects}
     groups = [g for g in groups if not (set(g) <= set(DRIFTS) and set(g) & alone)]  # its means tell a drift from its rival
     return effects, groups, sizes, last

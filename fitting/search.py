@@ -68,7 +68,8 @@ class Reached:
 
     `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were;
     `foretell`: what fits say of the check recordings; `under_way`: trials by name of a round that has not come to its end;
-    `ended`: whether the time was over before the search was through.
+    `unsure`: whether check recordings must speak for what that round finds; `late`: whether the time was over before the search
+    was through; `partial`: whether what was reached stands on a round that did not come to its end.
     """
 
     current: object
@@ -77,7 +78,9 @@ class Reached:
     form: str | None = None
     foretell: Foreteller | None = None
     under_way: dict = dataclasses.field(default_factory=dict)
-    ended: bool = False
+    unsure: bool = False
+    late: bool = False
+    partial: bool = False
 
     def adopt(self, best, good):
         """Go on from a trial, beside the others that earned their place."""
@@ -107,8 +110,8 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
         if state.steps and state.current is not state.steps[-1][0].result:
             ends(state.current)
     except Late:
-        state.ended = True
-        _adopt_of(state, base, check)
+        state.late = True
+        state.partial = _adopt_of(state, base, check) or not state.steps
     return state
 
 
@@ -120,8 +123,8 @@ def _forward(task, base, state, candidates, check, ends, free_means):
         top = leaders(candidates)
         if not top or abs(top[0].z) < Z_THRESHOLD:
             break
-        unsure = _calm(state) and abs(top[0].z) < SECOND_Z
-        if unsure and not state.foretell:
+        state.unsure = _calm(state) and abs(top[0].z) < SECOND_Z
+        if state.unsure and not state.foretell:
             break
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
             break
@@ -143,7 +146,7 @@ def _forward(task, base, state, candidates, check, ends, free_means):
             if check and not _predicts_worse(state.current, best.result, state.foretell):
                 state.current, state.form, made_up = best.result, best.name, best.candidate
             break
-        if _not_confirmed(state, best, excess, check, unsure):
+        if _not_confirmed(state, best, excess, check):
             break
         left = screened(best.result, task.choices)
         if best.name not in SLOW and free_means(best.result, best.result, left):
@@ -180,24 +183,26 @@ def _makes_up_for_form(state, base, best) -> bool:
     return best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best)
 
 
-def _not_confirmed(state, best, excess, check, unsure: bool) -> bool:
-    """Whether check recordings speak against a further effect, or not for one of which the recordings are `unsure`."""
+def _not_confirmed(state, best, excess, check) -> bool:
+    """Whether check recordings speak against a further effect, or not for one of which the recordings are unsure."""
     further = state.steps and check and not _decides(state.current, best, excess)
     if further and _predicts_worse(state.current, best.result, state.foretell):
         return True
-    return unsure and best.drop + _confirmed(state.current, best.result, state.foretell) < SECOND_Z**2
+    return state.unsure and best.drop + _confirmed(state.current, best.result, state.foretell) < SECOND_Z**2
 
 
-def _adopt_of(state, base, check):
-    """Adopt the best of the round under way, where there is one that it would not have refused."""
+def _adopt_of(state, base, check) -> bool:
+    """Adopt the best of the round under way, where there is one that it would not have refused; whether there was."""
     trials = list(state.under_way.values())
     state.tried = {t.name: t.candidate for t in trials} | state.tried
     good, best = _best_of(trials)
-    excess, unsure = max(excess_of(state.current), MIN_DROP), _calm(state)
-    if best is None or unsure and not state.foretell or _takes_too_little(state, best, excess) or _makes_up_for_form(state, base, best):
-        return
-    if not _not_confirmed(state, best, excess, check, unsure):
-        state.adopt(best, good)
+    excess = max(excess_of(state.current), MIN_DROP)
+    if best is None or _takes_too_little(state, best, excess) or _makes_up_for_form(state, base, best):
+        return False
+    if _not_confirmed(state, best, excess, check):
+        return False
+    state.adopt(best, good)
+    return True
 
 
 def _hopeless(current, leader, excess) -> bool:
@@ -228,6 +233,9 @@ def _trials(task, current, top, candidates, excess, under_way) -> list[Trial]:
         first = together(
             [begun(c, useful()) for c in these], task.progress, lambda k, results: _needless(these[k], results.values())
         )
+        for c, t in zip(these, first, strict=True):
+            if t is None:  # needless, ended or not
+                under_way.pop(c.name, None)
         first = [t for t in first if t is not None]
         trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], task.progress))
         let_go()

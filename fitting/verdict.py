@@ -124,7 +124,7 @@ def dominant(evidence) -> bool:
     """Whether the one effect found leaves far less than any other that was fitted in its place: what it leaves is then its
     law's form. Physics outside the catalogue is taken up by several effects, one about as well as the next."""
     steps, current = evidence.reached.steps, evidence.reached.current
-    if len(steps) != 1 or evidence.reached.ended:  # others were not fitted then
+    if len(steps) != 1 or evidence.reached.partial:  # others were not fitted then
         return False
     best, _, good, _ = steps[0]
     tried = [c for c in evidence.reached.tried.values() if c.achieved_chi2_drop is not None and c.name != best.name]
@@ -165,8 +165,8 @@ def _silent(evidence, common, dropped, rough) -> Diagnosis:
         text = f"these recordings cannot tell whether {' or '.join(asked)} is there: a density that differs by a little does the same. "
         text += f"The fit stands at chi2/N = {evidence.excess:.2f} without it; another channel has to show it, the flux in a pick-up coil for one."
         return Diagnosis("absorbed", text, **common)
-    text = f"no effect {asked_for(only)} was found{' by then' if evidence.reached.ended else ''}: chi2/N = {evidence.excess:.2f} and "
-    if evidence.reached.ended:
+    text = f"no effect {asked_for(only)} was found{' by then' if evidence.reached.partial else ''}: chi2/N = {evidence.excess:.2f} and "
+    if evidence.reached.partial:
         text += "what scores was not all fitted."
     elif dropped:
         text += f"{dropped}, which serves best, takes less than half of what is above the noise."
@@ -216,6 +216,7 @@ def _attributed(evidence, common, effects, swap, asked) -> Diagnosis:
         f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in common["check"]
     )
     text = f"{named} {'was' if len(effects) == 1 else 'were'} left out: {_fall(evidence)}."
+    text += " Not all rivals were fitted." if evidence.reached.partial else ""
     text += f" On check recordings: {better}." if better else " Record a check at another frequency to confirm it."
     if swap:
         text += f" {swap[0]} To tell: {asked['text']}."
@@ -255,7 +256,7 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
     best = steps[0][0].name if steps else (common["candidates"][0].name if common["candidates"] else "none")
     which = asked_for(evidence.only)
     nothing = f"that no effect {which} both explains and foretells" if note else f"that no effect {which} explains"
-    nothing += ", of those that were fitted by then" if evidence.reached.ended else ""
+    nothing += ", of those that were fitted by then" if evidence.reached.partial else ""
     text = (
         f"something is missing {nothing} (chi2/N = {evidence.excess:.3g} at best; {best} comes nearest and explains "
         f"{max(evidence.share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."

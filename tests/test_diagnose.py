@@ -138,7 +138,8 @@ def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, 
     monkeypatch.setattr(search_module, part, over)
     found = diagnose(runs, bench, check=checks, choices=choices, minutes=2.5)
     assert found.verdict == said and [e["name"] for e in found.effects] == named
-    assert "cut short by its limit of 2.5 min" in found.message and found.as_dict()["ended_after"] == 2.5
+    assert "limit of 2.5 min" in found.message and found.as_dict()["ended_after"] == 2.5
+    assert all(e["confidence"] <= 0.5 for e in found.effects) and ("Not all rivals were fitted" in found.message) == bool(named)
     assert found.base.converged and (found.repaired is not None) == bool(named)
 
 
@@ -159,8 +160,8 @@ def test_of_a_round_that_was_ended_the_best_trial_is_kept_where_a_full_round_wou
 
     alone(monkeypatch, _trials=trials)
     reached = search_module.search(Task((), None), plain, [scored("creep", 40.0)])
-    assert reached.ended and [best.name for best, *_ in reached.steps] == adopted and set(reached.tried) == {"creep", "backlash"}
-    assert reached.current is (second if len(adopted) > 1 else first)
+    assert reached.late and [best.name for best, *_ in reached.steps] == adopted and set(reached.tried) == {"creep", "backlash"}
+    assert reached.current is (second if len(adopted) > 1 else first) and reached.partial == (len(adopted) > 1)
 
 
 def alone(monkeypatch, **made):
@@ -182,8 +183,8 @@ def test_what_a_round_has_refused_is_not_adopted_when_the_time_is_over_later(mon
 
     alone(monkeypatch, _trials=lambda *a: next(rounds), backward=late)
     reached = search_module.search(Task((), None), plain, [scored("creep", 40.0)], check=("one",))
-    assert reached.ended and [best.name for best, *_ in reached.steps] == ["creep"] and reached.form == "backlash"
-    assert reached.current is form
+    assert reached.late and [best.name for best, *_ in reached.steps] == ["creep"] and reached.form == "backlash"
+    assert reached.current is form and not reached.partial
 
 
 @pytest.mark.parametrize(("chi2", "said"), [(5.0, "of those that were fitted by then"), (1.0, "what scores was not all fitted")])
@@ -191,12 +192,31 @@ def test_a_verdict_after_the_time_is_over_claims_nothing_of_what_was_not_fitted(
     plain = a_fit(chi2, 58.0)
     evidence = dataclasses.replace(evidence_of([], plain, plain, (scored("creep", 40.0),), {}), bench=bench)
     evidence = dataclasses.replace(evidence, where={"by_block": {"coil": 1.0}, "by_field": [1.0, 0.0]})
-    assert said in verdict(evidence.cut_short()).message and said not in verdict(evidence).message
+    assert said in verdict(partial(evidence)).message and said not in verdict(evidence).message
     alone = a_fit(1.4, 60.0, "creep")
     step = trial("creep", alone, 1360.0)
     others = {n: trial(n, a_fit(9.0, 60.0), 600.0).candidate for n in ("creep", "backlash")}
     found = evidence_of([(step, [step], [step], a_fit(15.0, 58.0))], a_fit(15.0, 58.0), alone, (), others)
-    assert dominant(found) and not dominant(found.cut_short())
+    assert dominant(found) and not dominant(partial(found))
+
+
+def test_the_verdict_of_a_search_that_was_through_stands_where_the_fits_that_may_change_it_come_too_late(monkeypatch):
+    plain, whole = a_fit(15.0, 58.0), a_fit(1.4, 60.0, "creep")
+    step = trial("creep", whole, 1360.0)
+    others = {n: trial(n, a_fit(9.0, 60.0), 600.0).candidate for n in ("creep", "backlash")}
+    evidence = evidence_of([(step, [step], [step], plain)], plain, whole, (scored("creep", 40.0),), others)
+
+    def late(*_):
+        raise Late
+
+    monkeypatch.setattr(module, "_thorough", late)
+    found = module._concluded(Task((), None), evidence)
+    assert found.verdict == "attributed" and found.message == verdict(evidence).message
+
+
+def partial(evidence):
+    """The same, of a round that did not come to its end."""
+    return dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, partial=True))
 
 
 def scored(name, z, visibility=0.1, **achieved):

@@ -28,9 +28,9 @@ def spoken(text: str, names) -> str:
 
 
 def tone(found) -> str:
-    """The colour of the banner: a silent verdict over a misfit is a warning."""
+    """The colour of the banner: a silent verdict over a misfit, or of a search cut short, is a warning."""
     silent = found["verdict"] == "nothing_missing"
-    return "warn" if silent and still_left(found) else TONES.get(found["verdict"], "bad")
+    return "warn" if silent and (still_left(found) or found.get("ended_after")) else TONES.get(found["verdict"], "bad")
 
 
 def still_left(found) -> str:
@@ -54,7 +54,7 @@ def still_left(found) -> str:
 
 def headline(found) -> str:
     """The verdict in plain words, and whether the search was ended."""
-    return _headline(found) + (" (the search was cut short by its limit of time)" if found.get("ended_after") else "")
+    return _headline(found) + (" (its limit of time left out what was still to be tried)" if found.get("ended_after") else "")
 
 
 def _headline(found) -> str:

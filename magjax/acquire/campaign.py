@@ -171,7 +171,7 @@ def sine_entry(frequency, amplitude, offset, settings, rate_max) -> Entry:
     if not (frequency > 0 and amplitude > 0):
         raise ConfigurationError(f"a sine of {amplitude:g} A at {frequency:g} Hz: give both above zero")
     width = _width(frequency, settings["samples"], rate_max)
-    rate = round(1000 * frequency * width) / 1000
+    rate = min(round(1000 * frequency * width) / 1000, rate_max)
     drive = {"kind": "sine", "samples": width, "periods": 0, "amplitude": amplitude, "offset": offset, "factor": 1.0}
     text = f"sine {frequency:g} Hz, {amplitude:g} A about {offset:g} A"
     name = f"sine_{frequency:g}Hz_{amplitude:g}A"

@@ -19,7 +19,7 @@ def run(_command: str, arguments: list[str]) -> int:
     _record_options(p)
     p.add_argument("--plan", help="study file (TOML) for the first recordings (default: six sines)")
     p.add_argument("--recordings", type=int, default=20, help="budget: recordings (default 20)")
-    p.add_argument("--minutes", type=float, default=30.0, help=f"budget: minutes (default 30); a diagnosis takes {MINUTES:g} at most")
+    p.add_argument("--minutes", type=float, default=30.0, help=f"budget: minutes (default 30); the search of each diagnosis ends after {MINUTES:g}")
     options = p.parse_args(arguments)
     from magjax.acquire.campaign import read_plan
     from magjax.acquire.display import Live
