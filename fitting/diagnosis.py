@@ -33,7 +33,7 @@ class Diagnosis:
     repaired: object = None
     placebo: dict | None = None
     asked: tuple = ()  # the effects that alone were asked for, where these were named
-    ended_after: float | None = None  # minutes, where the search was ended before it was through
+    ended_after: float | None = None  # the limit, minutes, where it left something out
 
     def __str__(self):
         return f"{self.verdict}: {self._said()}"

@@ -131,7 +131,6 @@ def _forward(task, base, state, candidates, check, ends, free_means):
         excess = max(excess_of(state.current), MIN_DROP)
         if state.steps and _hopeless(state.current, top[0], excess):
             break
-        state.under_way = {}
         trials = _trials(task, state.current, top, candidates, excess, state.under_way)
         state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit

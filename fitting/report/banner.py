@@ -53,8 +53,8 @@ def still_left(found) -> str:
 
 
 def headline(found) -> str:
-    """The verdict in plain words, and whether the search was ended."""
-    return _headline(found) + (" (its limit of time left out what was still to be tried)" if found.get("ended_after") else "")
+    """The verdict in plain words, and whether a limit of time left something out."""
+    return _headline(found) + ("; the limit of time came before all was tried" if found.get("ended_after") else "")
 
 
 def _headline(found) -> str:

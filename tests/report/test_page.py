@@ -264,6 +264,8 @@ def test_a_silent_headline_says_what_is_left(diagnoses, folders, tmp_path):
     found = diagnoses["nothing_missing"].as_dict()
     good = {**found, "base": {**found["base"], "chi2_per_sample": 1.0, "recordings": [{"chi2_per_sample": 1.2}]}}
     assert headline(good) == "Nothing is missing: the model meets the recordings to their noise" and tone(good) == "good"
+    cut = {**good, "ended_after": 15.0}
+    assert headline(cut) == "No effect of the catalogue was found; the limit of time came before all was tried" and tone(cut) == "warn"
     for wrong, said in (
         ({"base": {**good["base"], "chi2_per_sample": 1.31}}, "χ²/N = 1.31 is left"),
         (
