@@ -51,9 +51,10 @@ def test_settled_and_converged(kind):
     assert 1e-5 < np.ptp(y) < 7e-5
 
 
-@pytest.mark.parametrize(
-    "name", ["excess_loss", "field_diffusion", "magnetic_aftereffect", "coulomb_friction", "duffing_stiffness"]
-)
+@pytest.mark.parametrize("name", [
+    "magnetic_aftereffect", "coulomb_friction",
+    *(pytest.param(n, marks=pytest.mark.long) for n in ("excess_loss", "field_diffusion", "duffing_stiffness")),
+])  # fmt: skip
 def test_effects_settle(name):
     bench = ConcealedBench(TRUTH, {name: VISIBLE[name][2]}, "heavy", "negative", np.random.default_rng(3))
     first, second = (bench.run(DRIVES[1:], steps=500, settle=s)["reading"] for s in (6, 9))

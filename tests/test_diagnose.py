@@ -71,9 +71,12 @@ def test_silent_where_nothing_is_missing(bench):
 
 @pytest.mark.parametrize(
     ("asked", "said"),
-    [(("mean_field", "linear_strain"), "absorbed"), (("mean_field", "sensor_lag"), "nothing_missing"), (("mains_hum",), "nothing_missing")],
-    ids=["what the density hides", "one that would show", "one between the harmonics"],
-)  # fmt: skip
+    [
+        pytest.param(("mean_field", "linear_strain"), "absorbed", id="what the density hides"),
+        pytest.param(("mean_field", "sensor_lag"), "nothing_missing", id="one that would show", marks=pytest.mark.long),
+        pytest.param(("mains_hum",), "nothing_missing", id="one between the harmonics", marks=pytest.mark.long),
+    ],
+)
 def test_effects_that_are_asked_for_alone(bench, asked, said):
     runs, _ = study(bench)
     found = diagnose(runs, bench, choices=Choices(fine=250, only=asked))
@@ -122,7 +125,10 @@ def test_names_a_concealed_sensor_filter(bench):
     assert not set(found.absorbed) & {c.name for c in found.candidates if c.achieved_chi2_drop is not None}
 
 
-@pytest.mark.parametrize(("ends", "said", "named"), [("at once", "unknown_at", []), ("after the leaders", "attributed", ["sensor_lag"])])
+@pytest.mark.parametrize(
+    ("ends", "said", "named"),
+    [pytest.param("at once", "unknown_at", [], marks=pytest.mark.long), ("after the leaders", "attributed", ["sensor_lag"])],
+)
 def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, ends, said, named):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
     asked = {"sensor_lag", "amplifier_lag", "transport_delay", "duffing_stiffness"}

@@ -23,6 +23,7 @@ N = 160
 CURRENT = jnp.asarray(sine(N, 0.7))
 DT = 1 / (80 * N)
 named = pytest.mark.parametrize("kind", CATALOGUE, ids=lambda k: k.name)
+SAMPLE = ("amplifier_lag", "excess_loss", "mean_field", "strain_hysteresis", "second_mode", "sensor_lag")  # one of each block
 
 
 @eqx.filter_jit
@@ -45,7 +46,15 @@ def test_declares_what_the_documentation_needs(kind):
     assert kind.__doc__ and kind.__module__.endswith(kind.name)
 
 
-@named
+def test_at_their_nulls_all_of_them_together_change_nothing():
+    act, base = actuator(20), np.asarray(reading(actuator(20)))
+    for kind in CATALOGUE:
+        act = act.with_effect(kind())
+    assert len(act.effects) == len(CATALOGUE)
+    assert np.abs(np.asarray(reading(act)) - base).max() <= 2e-15 * np.abs(base).max()
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[] if k.name in SAMPLE else pytest.mark.long, id=k.name) for k in CATALOGUE])
 def test_null_gradient_and_batch(kind):
     act = actuator(20)
     extended = act.with_effect(kind())
@@ -88,7 +97,7 @@ def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():
     assert [e.name for e in again.effects] == ["duffing_stiffness", "backlash"] and float(again.effects[0].k3) == 0.1
 
 
-@pytest.mark.parametrize("linkage", [0.0, 4e-3])
+@pytest.mark.parametrize("linkage", [pytest.param(0.0, marks=pytest.mark.long), 4e-3])
 def test_a_limited_voltage_bounds_the_current(linkage):
     command, limit = np.asarray(CURRENT), 0.6
     effect = effects.AmplifierClipping(inverse_limit=1 / limit, tau_L=2e-3, linkage=linkage)

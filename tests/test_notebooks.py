@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
-LONG = ("02", "03", "06", "07")
+LONG = ("01", "02", "03", "06", "07")
 SOURCES = sorted(FOLDER.glob("0*.py"))
 RUNS = [pytest.param(p, marks=[pytest.mark.long] if p.name.startswith(LONG) else [], id=p.stem) for p in SOURCES]
 EACH = pytest.mark.parametrize("source", SOURCES, ids=lambda p: p.stem)

@@ -43,7 +43,8 @@ def some(*frequencies, noise=2):
     return [record(concealed_actuator(load_bench("aa-050h")), f, 0.6, 0.0, rng, f"{f}") for f in frequencies]
 
 
-@pytest.mark.parametrize("rest", [pytest.param("negative", marks=pytest.mark.long), "demagnetized"])
+@pytest.mark.long
+@pytest.mark.parametrize("rest", ["negative", "demagnetized"])
 def test_they_are_those_of_the_whole_chain(rest):
     """Seven recordings on two grids, more unknowns than go through at once, effects on either side of the hysteresis."""
     recordings = [modulated(concealed_actuator(load_bench("aa-050h"))), *some(20, 50, 90, 120, 150, 200)]
@@ -103,7 +104,11 @@ def test_so_they_are_of_a_rod_in_shells(beside):
     assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
 
 
-@pytest.mark.parametrize("effect", [effects.MagneticAftereffect(share=0.02), effects.SecondEddyPath(kappa=0.3)], ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    "effect",
+    [effects.MagneticAftereffect(share=0.02), pytest.param(effects.SecondEddyPath(kappa=0.3), marks=pytest.mark.long)],
+    ids=lambda e: e.name,
+)
 def test_so_they_are_of_states_that_are_led_to_where_they_repeat(effect):
     """The end of a period reads what stood at the one before."""
     found, expected = along_some_directions(effect)

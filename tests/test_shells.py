@@ -30,16 +30,24 @@ def test_the_matrix_is_that_of_a_cylinder():
         assert D[i, j] == pytest.approx(9 * whole, abs=2e-3)
 
 
-@pytest.mark.parametrize("scheme", ["bdf2", "trapezoid"])
+BESIDE = {
+    "alone": (),
+    "excess_loss": (effects.ExcessLoss(k=20.0),),
+    "mean_field+magnetic_aftereffect": (effects.MeanField(alpha=0.01), effects.MagneticAftereffect(share=0.1)),
+    "second_eddy_path+rate_dependent_switching": (
+        effects.SecondEddyPath(kappa=0.1, tau=1e-3, air=0.5), effects.RateDependentSwitching(gamma=20.0),
+    ),
+}  # fmt: skip
+SAMPLE = {("excess_loss", "bdf2"), ("mean_field+magnetic_aftereffect", "trapezoid")}
+
+
 @pytest.mark.parametrize(
-    "extra",
+    ("scheme", "extra"),
     [
-        (),
-        (effects.ExcessLoss(k=20.0),),
-        (effects.MeanField(alpha=0.01), effects.MagneticAftereffect(share=0.1)),
-        (effects.SecondEddyPath(kappa=0.1, tau=1e-3, air=0.5), effects.RateDependentSwitching(gamma=20.0)),
+        pytest.param(scheme, extra, id=f"{name}-{scheme}", marks=[] if (name, scheme) in SAMPLE else pytest.mark.long)
+        for name, extra in BESIDE.items()
+        for scheme in ("bdf2", "trapezoid")
     ],
-    ids=lambda e: "+".join(x.name for x in e) or "alone",
 )
 def test_shells_that_share_one_field_march_as_the_rod_does(scheme, extra):
     act = actuator(20)

@@ -33,7 +33,7 @@ def loop(amplitude, offset, n=200):
     return offset + amplitude * np.sin(2 * np.pi * np.arange(n + 1) / n)
 
 
-@pytest.mark.parametrize("rest", [-400.0, 0.0, 130.0, 650.0])
+@pytest.mark.parametrize("rest", [-400.0, *(pytest.param(r, marks=pytest.mark.long) for r in (0.0, 650.0)), 130.0])
 @pytest.mark.parametrize(("amplitude", "offset"), [(300.0, 0.0), (300.0, 200.0), (500.0, -300.0)])
 def test_unreached_relays_equal_a_finely_decaying_history(rest, amplitude, offset):
     plain = Preisach(masses_of(), LOW, HIGH)
@@ -67,7 +67,7 @@ def test_rows_of_the_fit_say_the_same():
     assert unreached_row(basis, 400.0, -300.0, 120.0) @ x == pytest.approx(float(operator.unreached(400.0, -300.0)), rel=1e-12)
 
 
-@pytest.mark.parametrize("level", [7, 40])
+@pytest.mark.parametrize("level", [7, pytest.param(40, marks=pytest.mark.long)])
 def test_static_path_is_the_operator_and_its_gradient(level):
     rng = np.random.default_rng(2)
     masses = jnp.asarray(masses_of(3, level))
