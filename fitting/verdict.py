@@ -199,6 +199,7 @@ def _grouped(evidence, common, effects, groups, rivals, swap, asked) -> Diagnosi
         else "more than one effect explains what is missing"
     )
     text = f"{each}, and these recordings cannot tell them apart: {names}."
+    text += " Not all rivals were fitted." if evidence.reached.partial else ""
     if effects:
         text += f" Found beside it: {', '.join(e['name'] for e in effects)}."
     if swap:

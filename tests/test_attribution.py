@@ -133,8 +133,9 @@ def test_an_effect_that_leaves_far_less_than_all_others_is_named_whatever_its_fo
     ],
 )  # fmt: skip
 def test_a_group_is_told_in_a_sentence(groups, said):
-    evidence = SimpleNamespace(excess=1.0, command_only=False)
-    assert _grouped(evidence, {}, [], groups, [], None, None).message == said
+    whole, cut = (SimpleNamespace(excess=1.0, command_only=False, reached=SimpleNamespace(partial=p)) for p in (False, True))
+    assert _grouped(whole, {}, [], groups, [], None, None).message == said
+    assert _grouped(cut, {}, [], groups, [], None, None).message == f"{said} Not all rivals were fitted."
 
 
 def test_rivals_where_the_best_is_not_the_whole_truth():
