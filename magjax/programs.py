@@ -123,11 +123,15 @@ def _traced(function, constants, tree, leaves):
     """The form of what it returns, and the program."""
     from jax import export  # an old jax asks for a package here that it does not install
 
+    returned = []
+
     def flat(*leaves):
-        return function(*eqx.combine(jax.tree.unflatten(tree, leaves), constants))
+        arrays, form = jax.tree.flatten(function(*eqx.combine(jax.tree.unflatten(tree, leaves), constants)))
+        returned.append(form)  # by itself: a program whose results stand in modules has no lasting form
+        return arrays
 
     exported = export.export(jax.jit(flat))(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves))
-    return _form(jax.tree.unflatten(exported.out_tree, range(exported.out_tree.num_leaves))), exported
+    return _form(jax.tree.unflatten(returned[-1], range(returned[-1].num_leaves))), exported
 
 
 def _form(tree):

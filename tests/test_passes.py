@@ -155,6 +155,9 @@ def test_another_study_asks_for_no_other_programs(traced):
         data_residual(problem, z), data_jacobian(problem, z)
         assert sorted(traced) == new  # the last: of the chain without the effect, whose march is the same
         traced.clear()
+    programs.forget()  # as another process
+    data_residual(problem, z), data_jacobian(problem, z)
+    assert traced == []
     coarse, fine = problem.predictors  # the one of the Jacobian, the other of the residual
     assert np.array_equal(data_residual(problem, z), data_residual(dataclasses.replace(problem, predictors=(fine, fine)), z))
     assert np.array_equal(data_jacobian(problem, z), data_jacobian(dataclasses.replace(problem, predictors=(coarse, coarse)), z))
