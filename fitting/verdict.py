@@ -34,6 +34,7 @@ WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so 
 AS_EXPECTED = 3.0  # chi2 per number of check recordings in units of what the fit expects to miss: there it errs as it says it does;
 NEARER = (6.0, 0.3)  # or within this, and this share of the plain fit's
 SAYS_FOR = 10.0  # what these then say for a repair, as a fall of chi2, though their errors rise
+EXPECTED, AGAINST = 1.5, 0.1  # chi2 per number in these units, up to which a repair errs as it expects; share of its fall that they may speak against it
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
@@ -81,7 +82,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     worse = after > WORSE[0] * before + WORSE[1] * len(rows)
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     hardly = far_off and after > NO_BETTER[2] * before
-    if steps and (worse or hardly) and (evidence.missing and not rough or not as_expected(evidence)):  # a repair that foretells no better is not physics
+    expected = as_expected(evidence) or (not hardly and not evidence.missing and hardly_against(evidence))
+    if steps and (worse or hardly) and (evidence.missing and not rough or not expected):  # a repair that foretells no better is not physics
         how = "worse" if worse else "hardly better"
         return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
@@ -118,6 +120,15 @@ def as_expected(evidence) -> bool:
     now, before = (foretell(fit).whitened for fit in (evidence.reached.current, evidence.plain))
     near = now < AS_EXPECTED or now < min(NEARER[0], NEARER[1] * before)
     return near and foretell.says_for(evidence.reached.current, evidence.plain) > SAYS_FOR
+
+
+def hardly_against(evidence) -> bool:
+    """Whether the check recordings say next to nothing against what was found, though their errors rise: it errs on them as it
+    expects, for cells that no recording switched, and what they speak against it is little beside its fall of chi2."""
+    foretell, current, plain = evidence.reached.foretell, evidence.reached.current, evidence.plain
+    if not foretell or foretell(current) is None or not foretell(current).whitened < EXPECTED:
+        return False
+    return foretell.says_for(current, plain) > -AGAINST * (chi2_of(plain) - chi2_of(current))
 
 
 def dominant(evidence) -> bool:

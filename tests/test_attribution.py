@@ -472,6 +472,24 @@ def test_what_errs_as_it_expects_is_named_all_the_same(monkeypatch, expected, wo
     assert fitting.verdict.verdict(left).verdict == "unknown_at"
 
 
+@pytest.mark.parametrize(
+    ("chi2n", "before", "after", "word"),
+    [
+        (1.0, (1.4, 2.0), (1.3, 4.0), "attributed"),
+        (2.2, (1.4, 2.0), (1.3, 4.0), "unknown_at"),
+        (1.0, (7.0, 8.0), (6.8, 8.9), "unknown_at"),
+    ],
+    ids=["a little worse", "something left", "far off before and after"],
+)
+def test_what_checks_hardly_speak_against_is_named_where_nothing_is_left(monkeypatch, chi2n, before, after, word):
+    """But not where it should have mended what the plain model misses by far."""
+    evidence = evidence_of(monkeypatch, chi2n, before, after)
+    monkeypatch.setattr(fitting.verdict, "hardly_against", lambda e: True)
+    assert fitting.verdict.verdict(evidence).verdict == word
+    monkeypatch.setattr(fitting.verdict, "hardly_against", lambda e: False)
+    assert fitting.verdict.verdict(evidence).verdict == "unknown_at"
+
+
 @pytest.mark.parametrize(("after", "offered"), [((1.05, 3.0), False), ((5.0, 4.0), True)], ids=["worse", "better"])
 def test_an_unknown_offers_no_repair_that_foretells_worse(monkeypatch, after, offered):
     """A clipping amplifier in place of one with a dead zone missed a check recording by 8 um, where the plain model missed 0.2."""

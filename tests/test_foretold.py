@@ -144,3 +144,28 @@ def test_a_repair_that_errs_as_it_expects_may_be_named(white, before, says, foun
     assert as_expected(evidence) == found
     evidence.reached.foretell = None
     assert not as_expected(evidence)
+
+
+@pytest.mark.parametrize(
+    ("white", "says", "found"),
+    [(1.06, -8.7, True), (1.06, -17.0, False), (1.06, 3.0, True), (1.6, -8.7, False), (None, None, False)],
+)
+def test_checks_that_hardly_speak_against_a_repair_do_not_refuse_it(monkeypatch, white, says, found):
+    """A quartic law of 5 % on a rough density (chi2/N 1.25 to 1.03, a fall of 161) missed its check recording by 119 nm for 101,
+    and expected 240."""
+    from fitting import verdict
+
+    monkeypatch.setattr(verdict, "chi2_of", {"plain": 890.0, "now": 729.0}.get)
+    told = SimpleNamespace(whitened=white) if white else None
+
+    class Told:
+        def __call__(self, fitted):
+            return told
+
+        def says_for(self, after, plain):
+            return says
+
+    evidence = SimpleNamespace(plain="plain", reached=SimpleNamespace(foretell=Told(), current="now"))
+    assert verdict.hardly_against(evidence) == found
+    evidence.reached.foretell = None
+    assert not verdict.hardly_against(evidence)
