@@ -29,7 +29,7 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 STRICT = {"test_fit", "test_preisach", "test_transients"}  # simulation, operator and fit: no rank is promoted by accident
 
 
-LONGEST = ("test_diagnose", "test_measured", "test_blind_suite", "test_hum")  # first, so that no worker ends alone with one of them
+LONGEST = ("test_diagnose", "test_blind_suite", "test_measured", "test_hum")  # first, so that no worker ends alone with one of them
 
 
 def pytest_collection_modifyitems(items):
@@ -37,7 +37,9 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("long"):
             item.add_marker(pytest.mark.timeout(0))
-    items.sort(key=lambda item: item.module.__name__.rpartition(".")[2] not in LONGEST)
+    names = [item.module.__name__.rpartition(".")[2] for item in items]
+    rank = {name: LONGEST.index(name) if name in LONGEST else len(LONGEST) for name in names}  # programs of the first serve the next
+    items[:] = [item for _, item in sorted(zip(names, items, strict=True), key=lambda pair: rank[pair[0]])]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -45,6 +47,17 @@ def ranks(request):
     """In the modules of STRICT arrays of unlike rank do not meet."""
     with jax.numpy_rank_promotion("raise" if request.module.__name__.rpartition(".")[2] in STRICT else "allow"):
         yield
+
+
+HASTY = {"test_columns", "test_effects", "test_learned", "test_passes", "test_shells", "test_simulate", "test_start_memory"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def hasty_compiler(request):
+    """Modules whose programs run a few times and are compiled without optimizing: a third of their time. Where fits are made, not."""
+    jax.config.update("jax_disable_most_optimizations", request.module.__name__.rpartition(".")[2] in HASTY)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(autouse=True, scope="module")

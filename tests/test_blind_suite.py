@@ -43,7 +43,7 @@ def test_generator_shares_no_code():
         assert not {m.split(".")[0] for m in found} & {"magjax", "fitting", "jax", "equinox", "optimistix", "importlib"}, path
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [k if k in ("gauss", "rough") else pytest.param(k, marks=pytest.mark.long) for k in KINDS])
 def test_settled_and_converged(kind):
     bench = ConcealedBench(TRUTH, {}, kind, "demagnetized", np.random.default_rng(3))
     y = bench.run(DRIVES, steps=500, settle=4)["reading"]

@@ -50,7 +50,7 @@ def study(bench, effect=None, seed=5):
 
 def test_silent_where_nothing_is_missing(bench):
     runs, checks = study(bench)
-    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250))
+    found = diagnose(runs, bench, check=checks, choices=Choices())
     assert (
         found.verdict == "nothing_missing"
         and "no effect of the catalogue was found" in str(found)
@@ -79,7 +79,7 @@ def test_silent_where_nothing_is_missing(bench):
 )
 def test_effects_that_are_asked_for_alone(bench, asked, said):
     runs, _ = study(bench)
-    found = diagnose(runs, bench, choices=Choices(fine=250, only=asked))
+    found = diagnose(runs, bench, choices=Choices(only=asked))
     assert found.verdict == said and {c.name for c in found.candidates} <= set(asked)
     assert set(found.absorbed) == set(asked) & {"mean_field", "linear_strain"}
     assert said != "absorbed" or ("mean_field or linear_strain is there" in found.message and "pick-up coil" in found.message)
@@ -98,7 +98,7 @@ def test_what_says_nothing_on_a_bench_is_told(bench):
 @pytest.mark.long
 def test_the_base_of_a_diagnosis_is_that_on_the_finer_density_that_was_asked_for(bench):
     runs, checks = study(bench)
-    coarse = Choices(fine=250, knots=(8, 6), without=tuple(e.name for e in CATALOGUE))
+    coarse = Choices(knots=(8, 6), without=tuple(e.name for e in CATALOGUE))
     found = diagnose(runs, bench, check=checks, choices=coarse)
     assert found.verdict == "nothing_missing" and found.base.choices.knots > coarse.knots
     assert f"chi2/N = {found.base.chi2_per_sample:.2f}" in found.message
@@ -107,9 +107,9 @@ def test_the_base_of_a_diagnosis_is_that_on_the_finer_density_that_was_asked_for
 
 def test_names_a_concealed_sensor_filter(bench):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
-    asked = {"sensor_lag", "amplifier_lag", "transport_delay", "duffing_stiffness"}  # all of it: the blind suites
+    asked = {"sensor_lag", "transport_delay"}  # all of it: the blind suites
     others = tuple(e.name for e in CATALOGUE if e.name not in asked)
-    found = diagnose(runs, bench, check=checks, choices=Choices(fine=250, without=others))
+    found = diagnose(runs, bench, check=checks, choices=Choices(without=others))
     assert found.verdict == "attributed"
     (effect,) = found.effects
     assert effect["name"] == "sensor_lag"
@@ -131,8 +131,8 @@ def test_names_a_concealed_sensor_filter(bench):
 )
 def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, ends, said, named):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
-    asked = {"sensor_lag", "amplifier_lag", "transport_delay", "duffing_stiffness"}
-    choices = Choices(fine=250, without=tuple(e.name for e in CATALOGUE if e.name not in asked))
+    asked = {"sensor_lag", "transport_delay"}
+    choices = Choices(without=tuple(e.name for e in CATALOGUE if e.name not in asked))
     part = "leaders" if ends == "at once" else "family"  # too late for any effect, or for rivals alone
     now, made = [0.0], getattr(search_module, part)
 
@@ -577,7 +577,7 @@ def test_ctrl_c_ends_a_diagnosis(bench, inside):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        diagnose(runs[:3], bench, choices=Choices(fine=250, without=others), progress=stop)
+        diagnose(runs[:3], bench, choices=Choices(without=others), progress=stop)
     assert any(" and " in t for t in said) == (inside != "the first fit")
 
 
@@ -631,7 +631,7 @@ def test_a_swapped_sign_is_a_data_problem(bench):
     swapped = [
         Recording(r.time, {**r.channels, "displacement": 6e-5 - r.channels["displacement"]}, {}, r.origin, r.name) for r in runs
     ]
-    found = diagnose(swapped, bench, choices=Choices(fine=250, max_jacobians=8))
+    found = diagnose(swapped, bench, choices=Choices(max_jacobians=8))
     assert found.verdict == "data_problem" and "sign" in found.message
 
 

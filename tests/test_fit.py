@@ -610,6 +610,7 @@ def test_constants_within_their_errors_at_forty_seeds(bench, seed):
     jax.clear_caches()
 
 
+@pytest.mark.long
 def test_constants_are_not_drawn_off_by_masses_that_cannot_be_negative(bench):
     """Where the density is next to nothing noise can only add to it: on a rough one f0 lay 1.5 of its errors low in the mean."""
     signals, bound, quoted = settled("rough"), [], []

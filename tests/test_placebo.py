@@ -25,7 +25,7 @@ from tests.scale.test_fleet import ROOT
 
 DRIVES = ((10, 0.8, 0.1), (80, 0.5, -0.2), (250, 0.8, 0.1))
 KEPT = ("quartic_magnetostriction", "linear_strain", "sensor_nonlinearity")
-QUICK = Choices(fine=250, harmonics=30, without=tuple(e.name for e in CATALOGUE if e.name not in KEPT))
+QUICK = Choices(fine=250, without=tuple(e.name for e in CATALOGUE if e.name not in KEPT))
 
 
 def recorded(effect=None, seed=3):

@@ -93,7 +93,7 @@ BESIDE = {
     "loss and stress": (ExcessLoss(k=20.0), StressFeedback(stiffness=2e7)),
     "after-effect": (MagneticAftereffect(share=0.2),),
 }
-SAMPLE = {("bdf2", "loss and stress"), ("trapezoid", "after-effect")}
+SAMPLE = {("bdf2", "loss and stress")}
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_small_loops_and_high_frequencies_are_led_until_they_settle():
     n = 250
     for f, amplitude in ((5, 0.8), (100, 0.05), (400, 0.05), (1000, 0.6)):
         drive, dt = 0.1 + amplitude * np.sin(2 * np.pi * np.arange(n) / n), 1 / (f * n)
-        best = simulate(act, drive, dt, periodic=True, settle=120)
+        best = simulate(act, drive, dt, periodic=True, settle=120, corners=24)  # extrema that fall by roundings leave corners
         got = simulate(act, drive, dt, periodic=True)
         stroke = float(np.ptp(np.asarray(best.reading)))
         assert np.asarray(got.reading) == pytest.approx(np.asarray(best.reading), abs=3e-7 * stroke)

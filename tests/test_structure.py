@@ -67,7 +67,14 @@ def test_the_page_of_effects_is_up_to_date():
     assert all(f"## {e.name}" in written for e in CATALOGUE)
 
 
-@pytest.mark.parametrize("before", ["", "import fitting.fit", "from fitting.diagnose import Task"], ids=["first", "after fit", "after diagnose"])
+@pytest.mark.parametrize(
+    "before",
+    [
+        pytest.param("", marks=pytest.mark.long, id="first"),
+        pytest.param("import fitting.fit", marks=pytest.mark.long, id="after fit"),
+        pytest.param("from fitting.diagnose import Task", id="after diagnose"),
+    ],
+)
 def test_the_functions_are_what_the_package_gives_whatever_was_imported_before(before):
     code = f"{before}\nfrom fitting import diagnose, fit\nimport fitting\nfor f in (diagnose, fit, fitting.fit, fitting.diagnose): print(type(f).__name__)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == ["function"] * 4

@@ -187,8 +187,14 @@ def test_ctrl_c_stops_in_order(emulate, order):
     assert drive_at_zero(port)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("seconds", [0.3, 0.8, 1.5, None])
+@pytest.mark.parametrize(
+    ("seconds", "number"),
+    [
+        pytest.param(s, n, marks=[] if s in (0.3, None) or (s, n) == (0.8, signal.SIGINT) else pytest.mark.long)
+        for s in (0.3, 0.8, 1.5, None)
+        for n in (signal.SIGINT, signal.SIGTERM)
+    ],
+)
 def test_ctrl_c_at_odd_moments(emulate, tmp_path, seconds, number):
     """To the command line alone: while it imports, while the recorder starts, while it records."""
     device = emulate()

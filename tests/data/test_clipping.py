@@ -29,8 +29,8 @@ def is_clipped(x):
 
 
 @pytest.mark.parametrize("bits", BITS)
-@pytest.mark.parametrize("share", [0.9, 0.7, 0.5])
-@pytest.mark.parametrize("noise", [0.0, 1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("share", [0.9, *(pytest.param(s, marks=pytest.mark.long) for s in (0.7, 0.5))])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(1e-5, marks=pytest.mark.long), 1e-4, 1e-3])
 @pytest.mark.parametrize("sides", ["top", "both"])
 @pytest.mark.parametrize("noisy", ["before", "after"])
 def test_a_cut_sine_is_clipped(bits, share, noise, sides, noisy):
@@ -204,7 +204,7 @@ def test_measured_channels_are_not_clipped(measured):
                 assert not is_clipped(table[column][table["capture"] == capture]), (path.name, capture, column)
 
 
-@pytest.mark.parametrize("number, clipped", [(33, True), (16, False), (2, False)])  # a fault; fringe errors; an amplifier's limit
+@pytest.mark.parametrize("number, clipped", [(33, True), (16, False), pytest.param(2, False, marks=pytest.mark.long)])  # a fault; fringe errors; an amplifier's limit
 def test_benches_of_the_independent_generator(number, clipped):
     from tests.blind.cases import make_case, recordings_of
 

@@ -149,7 +149,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("effect", "of_reading", "left"), CASES)
+@pytest.mark.parametrize(("effect", "of_reading", "left"), [c if i in (1, 4, 5) else pytest.param(*c, marks=pytest.mark.long) for i, c in enumerate(CASES)])
 def test_compensation_of_a_repaired_actuator(effect, of_reading, left):
     act = actuator(25)
     repaired = act.with_effect(effect)
