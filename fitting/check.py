@@ -10,14 +10,32 @@ from .model import Predictor, predicted_lines
 from .spectra import evaluate_lines, reduce_recording
 
 SAMPLES, HARMONICS, PERIODS = 500, 40, 4  # of a prediction: points a period, lines, periods simulated
+WIDE = 160  # lines of one of a drive of many lines, such as a multisine, whose reading has more than HARMONICS
+MANY, TELLS = 5, 0.9  # order of a drive's last line from which it may be one, and share of what is between the lines that more must leave
 
 
-def predicted_periods(actuator, spectra) -> np.ndarray:
-    """Fourier coefficients of the settled reading on the drives of some spectra, (spectra, HARMONICS + 1)."""
-    turns = max(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) for s in spectra)
-    predictor = Predictor.build(spectra, SAMPLES, HARMONICS, PERIODS, int(4 * np.ceil(turns / 4)), apart=False)
-    found = [np.asarray(predicted_lines(part, actuator))[: len(places)] for part, places in predictor.batches()]
-    return np.concatenate(found)[np.asarray(predictor.index)]
+def all_lines(recording, bench):
+    """A periodic recording's `Spectrum`: with WIDE lines of the reading where its drive has many and HARMONICS leave some of them."""
+    spectrum = reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)
+    if np.flatnonzero(spectrum.drive)[-1:].sum() < MANY:
+        return spectrum
+    more = reduce_recording(recording, bench.drive, bench.output, WIDE, bench.columns)
+    return more if len(more.reading) > len(spectrum.reading) and more.noise_rms < TELLS * spectrum.noise_rms else spectrum
+
+
+def predicted_periods(actuator, spectra) -> list:
+    """Fourier coefficients of the settled reading on the drives of some spectra (`all_lines`), as many of each as it has lines."""
+    found = {}
+    for many in (False, True):
+        some = [k for k, s in enumerate(spectra) if (len(s.reading) > HARMONICS + 1) == many]
+        if not some:
+            continue
+        chosen = [spectra[k] for k in some]
+        turns = max(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) for s in chosen)
+        predictor = Predictor.build(chosen, SAMPLES, WIDE if many else HARMONICS, PERIODS, int(4 * np.ceil(turns / 4)), apart=False)
+        lines = np.concatenate([np.asarray(predicted_lines(part, actuator))[: len(places)] for part, places in predictor.batches()])
+        found |= dict(zip(some, lines[np.asarray(predictor.index)], strict=True))
+    return [found[k] for k in range(len(spectra))]
 
 
 def predictions(actuator, recordings, bench) -> list:
@@ -29,8 +47,8 @@ def predictions(actuator, recordings, bench) -> list:
             signals = simulate(actuator, drive, recording.dt, outside="saturate")  # told by `beyond_plane`
             found[k] = np.asarray(signals.reading), recording.channels[bench.output], None
     periodic = [k for k in range(len(recordings)) if k not in found]
-    spectra = [reduce_recording(recordings[k], bench.drive, bench.output, columns=bench.columns) for k in periodic]
-    for k, s, lines in zip(periodic, spectra, predicted_periods(actuator, spectra) if spectra else (), strict=True):
+    spectra = [all_lines(recordings[k], bench) for k in periodic]
+    for k, s, lines in zip(periodic, spectra, predicted_periods(actuator, spectra), strict=True):
         phases = np.arange(s.samples) * s.dt * s.frequency
         found[k] = evaluate_lines(lines, phases), recordings[k].channels[bench.output][: s.samples], s.noise_rms
     rows = [(recordings[k], *found[k]) for k in range(len(recordings))]

@@ -259,8 +259,8 @@ def _better(x, dt, longer, shorter):
     return longer if left < 0.3 * left_else else shorter
 
 
-def _leftover(x, dt, f):
-    """A function of a frequency near f (Hz): what the strongest harmonics of f leave of x; `orders` says which.
+def _leftover(x, dt, f, most: int = 5):
+    """A function of a frequency near f (Hz): what the strongest harmonics of f, `most` of them, leave of x; `orders` says which.
 
     The strongest lines are used, not the first ones: a modulated sine has its power far above its fundamental.
     """
@@ -268,7 +268,7 @@ def _leftover(x, dt, f):
     t = dt * np.arange(n)
     orders = np.arange(1, max(2, int(min(60, 0.4 / (f * dt))) + 1))
     strength = np.array([abs(np.dot(x, np.exp(-2j * np.pi * h * f * t))) for h in orders])
-    orders = orders[np.argsort(-strength, kind="stable")[:5]]
+    orders = orders[np.argsort(-strength, kind="stable")[:most]]
     orders = orders[strength[orders - 1] > 0.02 * strength.max()]
 
     def leftover(freq):
@@ -281,6 +281,17 @@ def _leftover(x, dt, f):
     return leftover
 
 
+def _least(leftover, f, width) -> float:
+    """The frequency near f, Hz, that leaves least, by parabolas."""
+    for _ in range(10):
+        cost = np.array([leftover(v) for v in (f - width, f, f + width)])
+        bend = cost[0] - 2 * cost[1] + cost[2]
+        shift = 0.5 * (cost[0] - cost[2]) / bend * width if bend > 0 else width * np.sign(cost[0] - cost[2])
+        f += float(np.clip(shift, -width, width))
+        width *= 0.4
+    return f
+
+
 def _refine(x, dt, f, reach):
     """The f within `reach` (Hz) whose strongest harmonics leave least of x: a scan, then parabolas."""
     n, leftover = len(x), _leftover(x, dt, f)
@@ -289,13 +300,10 @@ def _refine(x, dt, f, reach):
     around = f + step * np.arange(-int(np.ceil(reach / step)), int(np.ceil(reach / step)) + 1)
     around = around[around > 0.5 * f]
     f = float(around[np.argmin([leftover(v) for v in around])])
-    width = step
-    for _ in range(10):
-        cost = np.array([leftover(v) for v in (f - width, f, f + width)])
-        bend = cost[0] - 2 * cost[1] + cost[2]
-        shift = 0.5 * (cost[0] - cost[2]) / bend * width if bend > 0 else width * np.sign(cost[0] - cost[2])
-        f += float(np.clip(shift, -width, width))
-        width *= 0.4
+    f = _least(leftover, f, step)
+    every = _leftover(x, dt, f, 40)
+    if len(every.orders) > len(orders):  # of a multisine, whose other lines draw the strongest ones off
+        f = _least(every, f, step)
     # a record that closes within a hundredth of a sample is taken to close
     samples = 1 / (f * dt)
     nearest = round(samples * 200) / 200

@@ -8,13 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fitting.check import beyond_plane, check_errors, predictions
+from fitting.check import all_lines, beyond_plane, check_errors, predictions
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.diagnosis import Diagnosis
 from fitting.reach import beyond_text
 from fitting.report.tables import checks
 from fitting.setup import Choices
+from fitting.spectra import reduce_recording
 from fitting.task import Clock, Task
 from magjax.bench import load_bench
 from magjax.effects import AmplifierClipping
@@ -69,6 +70,22 @@ def test_recordings_of_all_kinds_are_foretold_together():
     rows = check_errors(actuator, actuator, runs, bench)
     assert [r["file"] for r in rows] == ["runs/plain.csv", "runs/short.csv", "many.csv", "runs/small.csv"]
     assert all(r["rms_before"] == r["rms_after"] > 0 for r in rows)
+
+
+def test_a_drive_of_many_lines_is_foretold_to_its_noise():
+    """The reading of eleven tones up to the 37th order has lines beyond the fortieth: without these it was missed by four times its noise."""
+    bench, noise = load_bench("aa-050h"), 4e-8
+    rng, phase = np.random.default_rng(4), np.arange(4 * 1600) / 1600
+    orders = (3, 7, 11, 13, 17, 19, 23, 27, 31, 33, 37)
+    current = 0.05 + sum(0.09 * np.sin(2 * np.pi * (k * phase + rng.random())) for k in orders)
+    signals = simulate(bench.actuator(), current[:1600], 1 / (1600 * 7.0), periodic=True)
+    reading = np.tile(np.asarray(signals.displacement), 4) + noise * rng.standard_normal(len(phase))
+    run = Recording(phase / 7.0, {"current": current, "displacement": reading}, {}, {"file": "multisine.csv"}, "multisine")
+    (row,) = check_errors(bench.actuator(), bench.actuator(), [run], bench)
+    assert row["noise_rms"] == pytest.approx(noise, rel=0.05) and row["rms_after"] < 1.1 * noise
+    narrow = reduce_recording(run, "current", "displacement")
+    assert narrow.noise_rms > 2 * noise and len(all_lines(run, bench).reading) > len(narrow.reading)
+    assert len(all_lines(recording(0.6, "plain.csv"), bench).reading) == len(narrow.reading)
 
 
 def test_a_simulation_still_refuses_unless_told_to_saturate():

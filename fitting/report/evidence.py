@@ -200,12 +200,11 @@ def _inside(result, chosen) -> dict:
 
 def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict:
     """Measured and predicted periods of check recordings, before and after a repair; `own_zeros`: which leaves each its level."""
-    from ..check import predicted_periods
-    from ..spectra import reduce_recording
+    from ..check import all_lines, predicted_periods
 
     found = {}
     periodic = [k for k, r in enumerate(recordings) if r.frequency() is not None]
-    spectra = [reduce_recording(recordings[k], bench.drive, bench.output, columns=bench.columns) for k in periodic]
+    spectra = [all_lines(recordings[k], bench) for k in periodic]
     if not spectra:
         return found
     first = predicted_periods(before, spectra)
