@@ -184,7 +184,7 @@ def _silent(evidence, common, dropped, rough) -> Diagnosis:
     else:
         best = evidence.candidates[0] if evidence.candidates else None
         highest = f"{best.name}, z = {best.z:.1f}" if best else "none"
-        earned = "earned its place" if rough else f"scores above {Z_THRESHOLD}"
+        earned = "earned its place" if rough or (best and abs(best.z) > Z_THRESHOLD) else f"scores above {Z_THRESHOLD}"
         text += f"none {earned} (highest: {highest})."
     if rough:
         text += ROUGH_TEXT

@@ -246,6 +246,14 @@ def evidence_of(steps, plain, current, candidates, tried):
     return Evidence(reached, (), plain, plain, candidates, (), None, ((), ()), {}, {}, ())
 
 
+@pytest.mark.parametrize(("z", "said"), [(7.7, "none earned its place (highest: creep, z = 7.7)"), (3.1, "none scores above 5.5 (highest: creep, z = 3.1)")])
+def test_silence_says_of_the_highest_score_what_it_came_to(bench, z, said):
+    plain = a_fit(1.0, 58.0)
+    evidence = dataclasses.replace(evidence_of([], plain, plain, (scored("creep", z),), {}), bench=bench)
+    found = verdict(dataclasses.replace(evidence, where={"by_block": {"coil": 1.0}, "by_field": [1.0, 0.0]}))
+    assert found.verdict == "nothing_missing" and said in found.message
+
+
 def test_shifts_are_those_of_the_base_whatever_step_named_the_effect():
     plain, half, whole = a_fit(15.0, 58.0), a_fit(4.0, 60.0, "creep"), a_fit(1.0, 62.0, "creep", "excess_loss")
     first, second = trial("creep", half, 1100.0), trial("excess_loss", whole, 300.0)
