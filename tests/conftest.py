@@ -18,7 +18,8 @@ import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
-cache = Path(os.environ.get("MAGJAX_CACHE", Path(tempfile.gettempdir()) / "magjax-test-cache"))
+# for the commands that tests start, too
+cache = Path(os.environ.setdefault("MAGJAX_CACHE", str(Path(tempfile.gettempdir()) / "magjax-test-cache")))
 cache.mkdir(parents=True, exist_ok=True)
 jax.config.update("jax_compilation_cache_dir", str(cache))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
