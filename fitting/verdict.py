@@ -82,8 +82,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     worse = after > WORSE[0] * before + WORSE[1] * len(rows)
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     hardly = far_off and after > NO_BETTER[2] * before
-    expected = as_expected(evidence) or (not hardly and not evidence.missing and hardly_against(evidence))
-    if steps and (worse or hardly) and (evidence.missing and not rough or not expected):  # a repair that foretells no better is not physics
+    if steps and (worse or hardly) and not foretold_all_the_same(evidence, rough, hardly):  # a repair that foretells no better is not physics
         how = "worse" if worse else "hardly better"
         return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
@@ -109,6 +108,14 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
             form += CREEPS_TEXT
     form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
+
+
+def foretold_all_the_same(evidence, rough, hardly) -> bool:
+    """Whether check recordings that a repair misses as far as before, or farther, do not refuse it; asked where they would alone,
+    for it takes Jacobians of theirs."""
+    if evidence.missing and not rough:
+        return False
+    return as_expected(evidence) or (not hardly and not evidence.missing and hardly_against(evidence))
 
 
 def as_expected(evidence) -> bool:

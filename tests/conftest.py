@@ -38,9 +38,8 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("long"):
             item.add_marker(pytest.mark.timeout(0))
-    names = [item.module.__name__.rpartition(".")[2] for item in items]
-    rank = {name: LONGEST.index(name) if name in LONGEST else len(LONGEST) for name in names}  # programs of the first serve the next
-    items[:] = [item for _, item in sorted(zip(names, items, strict=True), key=lambda pair: rank[pair[0]])]
+    last = len(LONGEST)  # in their order: programs of the first serve the next
+    items.sort(key=lambda item: {name: k for k, name in enumerate(LONGEST)}.get(item.module.__name__.rpartition(".")[2], last))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -50,7 +50,7 @@ def study(bench, effect=None, seed=5):
 
 def test_silent_where_nothing_is_missing(bench):
     runs, checks = study(bench)
-    found = diagnose(runs, bench, check=checks, choices=Choices())
+    found = diagnose(runs, bench, check=checks)
     assert (
         found.verdict == "nothing_missing"
         and "no effect of the catalogue was found" in str(found)

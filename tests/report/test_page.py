@@ -144,7 +144,7 @@ def test_svg_files_are_well_formed_and_nothing_is_half_written(folders, kind):
 
 
 def test_rebuilds_without_jax_and_tells_what_it_draws(folders, tmp_path):
-    for kind in ("attributed",):
+    for kind in ("fit", "attributed"):
         copy = tmp_path / kind
         shutil.copytree(folders[kind], copy)
         (copy / "report.html").unlink()
