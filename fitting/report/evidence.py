@@ -200,7 +200,7 @@ def _inside(result, chosen) -> dict:
 
 def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict:
     """Measured and predicted periods of check recordings, before and after a repair; `own_zeros`: which leaves each its level."""
-    from ..check import all_lines, predicted_periods
+    from ..check import HARMONICS, all_lines, predicted_periods
 
     found = {}
     periodic = [k for k, r in enumerate(recordings) if r.frequency() is not None]
@@ -211,7 +211,8 @@ def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict
     lines = {"before": first, "after": first if after is before else predicted_periods(after, spectra)}
     for at, (k, s) in enumerate(zip(periodic, spectra, strict=True)):
         recording = recordings[k]
-        phases, residue, count = by_phase(s, s.residue, BINS)
+        bins = BINS if len(s.reading) <= HARMONICS + 1 else 4 * BINS  # loops of many lines turn often
+        phases, residue, count = by_phase(s, s.residue, bins)
         measured = evaluate_lines(s.reading, phases) + residue
         entry = {
             "name": np.array(_short(recording.origin.get("file", recording.name))), "frequency": np.array(s.frequency), "phase": phases,
