@@ -29,10 +29,20 @@ from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
 from .locate import where
-from .own_signals import hum_on_harmonics, needless_zeros, own_zeros, record_level, sensor_zero, unsettled_means, with_zero
+from .own_signals import (
+    heat_on_harmonics,
+    hum_on_harmonics,
+    needless_zeros,
+    own_zeros,
+    record_level,
+    sensor_zero,
+    unsettled_means,
+    with_zero,
+)
 from .reach import BEYOND
 from .record_level import remove_from_checks
 from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance, worth_a_search
+from .rows import DRIFTS
 from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
@@ -106,7 +116,7 @@ def _diagnosed(task, check) -> Diagnosis:
     found = _examined(task.on(recordings=tuple(cleaned)), task, adopted, check)
     if not problem:
         return found
-    names = " and ".join(effect.name for effect, _ in adopted)
+    names = " and ".join("the drift" if effect.name in DRIFTS else effect.name for effect, _ in adopted)
     return dataclasses.replace(found, message=f"{found.message} As recorded, before {names} was taken out: {problem}.")
 
 
@@ -176,6 +186,9 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     if found := hum_on_harmonics(task, adopted, plain, candidates):
         cleaned, hum, freed = found
         return _examined(cleaned, measured, [*adopted, hum], check, freed)
+    if found := heat_on_harmonics(task, adopted, plain):
+        cleaned, heat, freed = found
+        return _examined(cleaned, measured, heat, check, freed)
     plain, candidates, zero, rival = sensor_zero(task, plain, candidates)
     if zeros and zero is None and (found := own_zeros(task, adopted, plain, candidates)):
         cleaned, own, freed = found
@@ -192,6 +205,9 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
             if found := hum_on_harmonics(task.sparing, adopted, current):
                 cleaned, hum, _ = found
                 anew.append({"task": task.on(recordings=cleaned.recordings), "adopted": [*adopted, hum]})
+            elif found := heat_on_harmonics(task.sparing, adopted, current):
+                cleaned, heat, _ = found
+                anew.append({"task": task.on(recordings=cleaned.recordings), "adopted": heat})
             elif zero is None and (better := _better_valley(task.sparing, plain, candidates, current)):
                 anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
         return bool(anew)

@@ -3,15 +3,28 @@
 Scored as the effects are: off everything that the base can do (`screen.Projector`).
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from .model import whitened
-from .record_level import HUM_TONES, MAINS
+from .record_level import HUM_TONES, MAINS, pulsation_lines
 from .screen import Projector
 
 SAME_SIZE = 0.8  # of what tones of any size in each recording would take, that those of one size must
+
+
+class HeatScore(NamedTuple):
+    """`z` of the pulsation, its `rate` and standard error, m/(A^2 s), the `zeros` beside it with theirs, m, the `fall` of chi2 by all."""
+
+    z: float
+    rate: float
+    stderr: float
+    zeros: np.ndarray
+    zero_errors: np.ndarray
+    fall: float
 
 
 def offset_score(problem, solution) -> float:
@@ -28,8 +41,12 @@ def zeros_score(problem, solution):
     columns = _projected(problem, projector, [(n, 0, 1.0) for n in range(len(problem.spectra))])
     zeros, *_ = np.linalg.lstsq(columns, -projector.residual, rcond=1e-6)
     fall = float(projector.residual @ projector.residual - np.sum((projector.residual + columns @ zeros) ** 2))
-    errors = np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns, rcond=1e-12)))
-    return float(np.sqrt(max(fall - len(zeros), 0.0))), zeros, errors
+    return float(np.sqrt(max(fall - len(zeros), 0.0))), zeros, _errors(columns)
+
+
+def _errors(columns):
+    """Standard errors of the sizes of columns."""
+    return np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns, rcond=1e-12)))
 
 
 def hum_score(problem, solution):
@@ -61,6 +78,25 @@ def hum_score(problem, solution):
     return best
 
 
+def heat_score(problem, solution, zeros: bool = False) -> HeatScore:
+    """The pulsation of the heat within the period (`record_level.pulsation_lines`), of one rate for all recordings, beside
+    everything the base can do; `zeros`: beside a zero of each recording, too, which began as warm as it was.
+    """
+    projector = Projector(problem, solution)
+    lines = np.zeros(problem.target.lines.shape, complex)
+    for row, s in zip(lines, problem.spectra, strict=True):
+        own = pulsation_lines(s)[: len(row)]
+        row[: len(own)] = own
+    column, residual = projector.project(_whitened(problem, lines)), projector.residual
+    beside = _projected(problem, projector, [(n, 0, 1.0) for n in range(len(problem.spectra))] if zeros else [])
+    left = column - beside @ np.linalg.lstsq(beside, column, rcond=1e-6)[0]
+    power = max(float(left @ left), 1e-300)
+    rate = -float(left @ residual) / power
+    levels = np.linalg.lstsq(beside, -residual - rate * column, rcond=1e-6)[0]
+    fall = residual @ residual - np.sum((residual + rate * column + beside @ levels) ** 2)
+    return HeatScore(rate * np.sqrt(power), rate, 1 / np.sqrt(power), levels, _errors(beside), float(fall))
+
+
 def _on_harmonics(problem, mains):
     """(recording, harmonic, multiple of the mains) wherever a tone of the hum and a harmonic cannot be told apart."""
     places = []
@@ -74,10 +110,15 @@ def _on_harmonics(problem, mains):
 
 def _projected(problem, projector, signals):
     """Columns of unit signals at (recording, harmonic, complex amplitude), off the tangent space: (rows, signals)."""
-    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
     rows = []
     for recording, harmonic, amplitude in signals:
         lines = np.zeros(problem.target.lines.shape, complex)
         lines[recording, harmonic] = amplitude
-        rows.append(projector.project(np.asarray(whitened(jnp.asarray(lines), zero))))
-    return np.stack(rows, axis=1)
+        rows.append(projector.project(_whitened(problem, lines)))
+    return np.stack(rows, axis=1) if rows else np.zeros((len(projector.residual), 0))
+
+
+def _whitened(problem, lines):
+    """Lines added to the readings in units of their noise, as a change of the misfit."""
+    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
+    return np.asarray(whitened(jnp.asarray(lines), zero))

@@ -11,8 +11,8 @@ import numpy as np
 from .attribute import BIC_DROP, CLOSE, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
 from .diagnosis import SILENT_CHI2, Diagnosis, least_excess
 from .finer import FINER_FROM
-from .on_lines import hum_score, offset_score, zeros_score
-from .record_level import hum_is_seen, hum_of, record_effects, remove_record_effect, zeros_of
+from .on_lines import heat_score, hum_score, offset_score, zeros_score
+from .record_level import by_heat, hum_is_seen, hum_of, pulsation_of, record_effects, remove_record_effect, zeros_of
 from .rows import DRIFTS
 from .screen import screened
 from .setup import spectra_of
@@ -23,7 +23,9 @@ FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far 
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
 NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
 MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the recordings must hold
-MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics must take
+MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics, or a rod's breathing with the heat, must take
+HEAT_PASSES, NOTHING_LEFT = 2, 2.0  # fits that find the rate of a pulsation, and z of what they may leave of it
+HEAT_RATE = 0.5  # of the pulsation, in units of the drift's: what cools fast breathes and drifts no more
 
 
 def record_level(recordings, spectra, bench, choices):
@@ -59,6 +61,56 @@ def hum_on_harmonics(task, adopted, base, candidates=()):
     if chi2_of(freed) > chi2_of(base) - MOST_OF_IT * excess:
         return None
     return cleaned, (effect, []), freed
+
+
+def heat_on_harmonics(task, adopted, base):
+    """Heat that shows between the harmonics as a drift pulses with the square of the current, too, and each recording begins as
+    warm as it is: adopted if both, or the pulsation alone, take most of what `base` leaves, at no less than the drift's rate.
+    Returns the task without them, all that was adopted, and its fit; None elsewhere.
+    """
+    bench, held = task.bench, {k for e, _ in adopted for k in ("zeros", "pulsation") if e.shapes.get(k)}
+    if held or bench.output != "displacement" or bench.drive != "current" or bench.quasistatic:
+        return None
+    drifts = [_as_heat(e, rivals, base.spectra) for e, rivals in adopted]
+    heat = next((e for e, _ in drifts if e.name == "thermal_drift"), None)
+    if heat is None or not base.chi2_per_sample > SILENT_CHI2:
+        return None
+    excess = excess_of(base)
+    for zeros in (False, True):
+        score = heat_score(base.problem, base.refined, zeros)
+        least = HEAT_RATE * abs(heat.amplitude)
+        if abs(score.z) < Z_THRESHOLD or score.fall < MOST_OF_IT * excess or abs(score.rate) < least:
+            continue
+        cleaned, more, freed = _without_heat(task, base, score)
+        if freed.chi2_per_sample < least_excess(freed) or chi2_of(freed) < chi2_of(base) - NEARLY_ALL * excess:
+            return cleaned, [*drifts, *((e, []) for e in more)], freed
+    return None
+
+
+def _as_heat(effect, rivals, spectra):
+    """A drift that was adopted, with its rivals, as that of a rod that warms, if it may be: alone. It may slow down, or turn,
+    where a record begins warm, and then tells nothing by its rates."""
+    heat = by_heat(effect, spectra) if effect.name == "zero_drift" and effect.shapes.get("own") else effect
+    return (heat, []) if heat.name == "thermal_drift" else (effect, rivals)
+
+
+def _without_heat(task, base, score):
+    """The task without a pulsation and with free means, if there are zeros; what was taken out; the fit. The rate is found again."""
+    free, rate = [], score.rate
+    if len(score.zeros):
+        free = zeros_of(base.spectra, score.z, score.zeros, score.zero_errors, ["thermal_drift"])
+    for _ in range(HEAT_PASSES):
+        more = [pulsation_of(base.spectra, score.z, rate, score.stderr), *free]
+        recordings = task.recordings
+        for effect in more:
+            recordings = remove_record_effect(recordings, effect, task.bench.output)
+        cleaned = task.on(recordings=tuple(recordings))
+        freed = cleaned.fit(base.actuator)
+        left = heat_score(freed.problem, freed.refined)
+        if abs(left.z) < NOTHING_LEFT:
+            break
+        rate += left.rate
+    return cleaned, more, freed
 
 
 def own_zeros(task, adopted, base, candidates):

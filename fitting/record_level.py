@@ -9,11 +9,12 @@ import numpy as np
 
 from magjax.recording import Recording
 
-from .spectra import fit_lines, reduce_recording, with_noise
+from .spectra import evaluate_lines, fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
 CLEAR_HUM, LEAST_HUM = 25.0, 0.25  # chi2 that hum of a size would take between the harmonics, and the share that must show
+AS_ALIKE = 1.02  # spread of drifts per heat in units of that of the drifts, up to which they may as well be heat
 OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record alone, and the share of the longer ones that must show it
 
 
@@ -57,6 +58,8 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
             found[name] = RecordEffect(name, float(z), float(amplitude), float(1 / np.sqrt(bottom)), shapes, tuple(columns))
     if own := _own_drifts(spectra, found["zero_drift"].z):
         found["zero_drift"] = own
+        if may_be_heat(own, spectra):
+            found["thermal_drift"] = by_heat(own, spectra)
     for f in MAINS:
         z, tones, fits = _hum(spectra, f)
         if "mains_hum" not in found or z > found["mains_hum"].z:
@@ -65,6 +68,44 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
                 "mains_hum", float(z), tones[0][1], float(error), {"f": f, "tones": tones}, tuple(fits)
             )
     return sorted(found.values(), key=lambda e: -abs(e.z))
+
+
+def mean_heat(spectra) -> np.ndarray:
+    """Mean square of the drive of each recording."""
+    return np.array([abs(s.drive[0]) ** 2 + 2 * np.sum(np.abs(s.drive[1:]) ** 2) for s in spectra])
+
+
+def by_heat(drifts, spectra) -> RecordEffect:
+    """Drifts of each record by itself (`_own_drifts`) as those of a rod that warms: their rate per squared drive."""
+    per_heat = _rates(drifts, spectra) / mean_heat(spectra)
+    size, error = float(np.median(per_heat)), float(np.std(per_heat) / np.sqrt(len(spectra)))
+    return dataclasses.replace(drifts, name="thermal_drift", amplitude=size, stderr=error)
+
+
+def may_be_heat(drifts, spectra) -> bool:
+    """Whether drifts of each record by itself go one way, at rates that go as much by the heat as they are alike."""
+    rates = _rates(drifts, spectra)
+    same = np.all(rates > 0) or np.all(rates < 0)
+    return bool(same and np.std(np.log(np.abs(rates / mean_heat(spectra)))) <= AS_ALIKE * np.std(np.log(np.abs(rates))))
+
+
+def _rates(drifts, spectra):
+    return np.array([column[-1] / (s.dt * s.samples) for column, s in zip(drifts.columns, spectra, strict=True)])
+
+
+def pulsation_lines(s) -> np.ndarray:
+    """What the heat of the drive's square adds within a period, at unit rate: Fourier coefficients 0.. of its integral over
+    time but for its mean, A^2 s."""
+    count = 4 * len(s.drive)
+    heat = np.fft.rfft(s.drive_at(np.arange(count) / count) ** 2)[: 2 * len(s.drive) - 1] / count
+    orders = np.arange(len(heat))
+    return np.where(orders > 0, heat / (2j * np.pi * np.maximum(orders, 1) * s.frequency), 0.0)
+
+
+def pulsation_of(spectra, z: float, rate: float, error: float) -> RecordEffect:
+    """The pulsation of the heat within the period, known from the harmonics (`on_lines.heat_score`)."""
+    columns = tuple(evaluate_lines(pulsation_lines(s), s.dt * s.frequency * np.arange(s.samples)) for s in spectra)
+    return RecordEffect("thermal_drift", z, rate, error, {"pulsation": True}, columns)
 
 
 def zeros_of(spectra, z: float, zeros, errors, adopted=()) -> list[RecordEffect]:
@@ -219,6 +260,8 @@ def remove_from_checks(recordings, adopted, bench):
                 columns = tuple(_hum(spectra, effect.shapes["f"], [a for _, a in effect.shapes["tones"]])[2])
             elif effect.shapes.get("own"):
                 columns = (drift_of(spectra[0])[1],)
+            elif effect.shapes.get("pulsation"):
+                columns = pulsation_of(spectra, effect.z, effect.amplitude, effect.stderr).columns
             else:
                 same = [c for n, shapes, c in record_columns([recording], spectra) if (n, shapes) == (effect.name, effect.shapes)]
                 columns = tuple(same[0])

@@ -82,7 +82,7 @@ def creeps_on(effect, evidence) -> bool:
     displacement, away from where all came from, and less than a decade of it."""
     actuator = evidence.reached.current.actuator
     found = "creep" in {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
-    if not found or effect.name not in DRIFTS or not effect.columns:
+    if not found or effect.name not in DRIFTS or not effect.columns or effect.shapes.get("pulsation"):
         return False
     scale = 1.0 if effect.shapes.get("own") else effect.amplitude
     drifts = scale * np.asarray([column[-1] - column[0] for column in effect.columns])

@@ -1,0 +1,89 @@
+"""Heat of the coil: it drifts through a record, pulses with the square of the current, and each record begins as warm as it is."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fitting.demo import concealed_actuator, record
+from fitting.diagnose import diagnose
+from fitting.own_signals import heat_on_harmonics, record_level
+from fitting.setup import Choices, spectra_of
+from fitting.task import Task
+from magjax.bench import load_bench
+from magjax.chain import Timeline
+from magjax.effects import CATALOGUE, ThermalDrift
+
+BENCH = load_bench("aa-050h")
+DRIVES = ((8, 0.8, 0.1), (12, 0.5, -0.2), (20, 0.65, 0.2), (35, 0.4, -0.3), (80, 0.7, 0.0), (200, 0.5, 0.1))
+WINDING, ROD = (2.4e-5, 0.8), (1.5e-6, 12.0)  # rate, m/(A^2 s), and time constant, s, of two nodes
+WARM = (3.0, 0.5, 8.0, 1.5, 5.0, 2.0)  # s, for which each drive has run before its record
+
+
+def expansion(time, current, warm, pulsation=True):
+    """Of both nodes, m; where nothing pulses, by the mean square of the current."""
+    dt, period = time[1] - time[0], len(time) // 4
+    before = int(round(warm / dt / period)) * period
+    heat = np.resize(current**2, before + len(time))
+    heat = heat if pulsation else np.full(len(heat), heat.mean())
+    line = Timeline(dt, len(heat), False)
+    nodes = (ThermalDrift(rate, tau).reading(0.0, {"current": jnp.sqrt(heat)}, line, None) for rate, tau in (WINDING, ROD))
+    return np.asarray(sum(nodes))[before:]
+
+
+def recorded(drives=DRIVES, **how):
+    """Recordings of a bench that warms."""
+    rng, truth, rows = np.random.default_rng(7), concealed_actuator(BENCH), []
+    for (f, amplitude, offset), warm in zip(drives, WARM, strict=False):
+        row = record(truth, f, amplitude, offset, rng, f"{f} Hz")
+        grown = expansion(row.time, row.channels["current"], warm, **how)
+        rows.append(dataclasses.replace(row, channels={**row.channels, "displacement": row.channels["displacement"] + grown}))
+    return rows
+
+
+def examined(rows):
+    """The task without the drift, what was adopted, and the plain fit."""
+    adopted, cleaned = record_level(rows, spectra_of(rows, BENCH), BENCH, Choices())
+    task = Task(tuple(cleaned), BENCH)
+    return task, adopted, task.fit(refine=False)
+
+
+def test_a_sine_warms_the_rod_as_the_exact_solution_does():
+    amplitude, tau, rate = 0.7, 0.4, 2e-5
+    w, t = 4 * np.pi * 9.0, np.linspace(0, 1, 4001)  # w: of the square
+    line = Timeline(t[1], len(t), False)
+    reading = ThermalDrift(rate, tau).reading(1.0, {"current": jnp.asarray(amplitude * np.sin(w * t / 2))}, line, None)
+    decay = np.exp(-t / tau)
+    pulse = (np.cos(w * t) / tau + w * np.sin(w * t) - decay / tau) / (1 / tau**2 + w**2)
+    exact = rate * amplitude**2 / 2 * (tau * (1 - decay) - pulse)
+    assert np.abs(np.asarray(reading) - 1.0 - exact).max() < 1e-5 * exact.max()
+    still = ThermalDrift(0.0, tau).reading(jnp.asarray(t), {"current": jnp.ones(len(t))}, line, None)
+    assert np.array_equal(np.asarray(still), t)
+
+
+def test_what_pulses_with_the_heat_is_heat_and_no_zero_that_drifts():
+    task, adopted, base = examined(recorded())
+    assert base.chi2_per_sample > 5
+    cleaned, told, freed = heat_on_harmonics(task, adopted, base)
+    assert [(e.name, rivals) for e, rivals in told] == [("thermal_drift", [])] * 3
+    assert freed.chi2_per_sample < 1.1
+    pulsation = next(e for e, _ in told if e.shapes.get("pulsation"))
+    assert pulsation.amplitude == pytest.approx(WINDING[0] + ROD[0], rel=0.15)
+    assert heat_on_harmonics(cleaned, told, freed) is None
+
+
+def test_a_drift_that_does_not_pulse_is_not_said_to():
+    task, adopted, base = examined(recorded(pulsation=False))
+    assert adopted and base.chi2_per_sample > 5  # by the zeros
+    assert heat_on_harmonics(task, adopted, base) is None
+
+
+@pytest.mark.long
+def test_a_rod_that_warms_is_named_and_no_physics():
+    asked = {"quartic_magnetostriction", "sensor_lag", "creep", "second_eddy_path"}  # all of it: the blind suites
+    others = tuple(e.name for e in CATALOGUE if e.name not in asked)
+    *runs, check = recorded()
+    found = diagnose(runs, BENCH, check=[check], choices=Choices(fine=250, without=others))
+    assert found.verdict == "attributed" and [e["name"] for e in found.effects] == ["thermal_drift"]
+    assert found.check[0]["rms_after"] < 1.3 * found.check[0]["noise_rms"]
