@@ -26,7 +26,7 @@ from .starts import unreached_row
 class Marched(eqx.Module):
     """Marches to first order, of all recordings of a predictor with one grid: (recordings, ...) each.
 
-    `field`, `magnetization`: (samples,), A/m, of the last period; `drive`: (2, samples, parameters), of applied field and current by
+    `field`, `magnetization`, `spread`: (samples,), of the last period; `drive`: (2, samples, parameters), of applied field and current by
     the parameters, the last of which is the sum of the masses, relative, as effects read it; `gain`: of the applied field by the
     current; `unreached`: (2,), of M by the highest and the lowest relay field of the last period.
     """
@@ -34,6 +34,7 @@ class Marched(eqx.Module):
     steps: Steps
     field: jax.Array
     magnetization: jax.Array
+    spread: jax.Array
     drive: jax.Array
     gain: jax.Array
     unreached: jax.Array
@@ -63,9 +64,9 @@ def marched_steps(template, names, point, predictor) -> Marched:
         steps = linearized(made, parameters, *whole, dt, predictor.corners, actuator.coil.scheme, count)
         relay = steps.relay_field[-count:].mean(axis=1)
         ends = jnp.max(relay), jnp.min(relay)
-        H, M = (x[-count - 1 : -1] for x in (steps.field, steps.magnetization))
+        H, M, spread = (x[-count - 1 : -1] for x in (steps.field, steps.magnetization, steps.spread))
         return Marched(
-            steps, H, M + actuator.hysteresis.unreached(*ends), jax.jacfwd(driven)(parameters),
+            steps, H, M + actuator.hysteresis.unreached(*ends), spread, jax.jacfwd(driven)(parameters),
             jax.jacfwd(actuator.coil.applied_field)(current[0]), jnp.stack(jax.jacfwd(actuator.hysteresis.unreached, (0, 1))(*ends)),
         )  # fmt: skip
 
@@ -89,26 +90,27 @@ class _Added(AbstractEffect):
         return reading + self.read
 
 
-SIGNALS = ("field", "magnetization", "current", "free displacement", "displacement", "reading")
+SIGNALS = ("field", "magnetization", "spread", "current", "free displacement", "displacement", "reading")
 
 
 @kept
 def read_rows(template, names, parameters, predictor, marched):
-    """The lines of all recordings of a predictor with one grid by the signals `SIGNALS`, (recordings, lines, 6, samples), and by the
+    """The lines of all recordings of a predictor with one grid by the signals `SIGNALS`, (recordings, lines, 7, samples), and by the
     parameters, (recordings, lines, parameters). Lines: the real parts of 0..harmonics, the imaginary ones of 1..harmonics.
 
-    `marched`: field and magnetization, (recordings, samples) each.
+    `marched`: field, magnetization and its spread, (recordings, samples) each.
     """
     count = predictor.harmonics + 1
 
-    def one(drive, dt, H, M):
+    def one(drive, dt, *fields):
         line, zero = Timeline(dt, drive.shape[0], True), jnp.zeros(())
 
         def lines(changes, parameters):
             actuator = template.replace(dict(zip(names, parameters, strict=True)))
-            changed = dataclasses.replace(actuator, effects=(*actuator.effects, _Added(*changes[3:])))
-            current = driven_current(actuator, drive, line) + changes[2]
-            s = finish_chain(changed, line, drive, current, H + changes[0], M + changes[1], H, zero, zero)
+            changed = dataclasses.replace(actuator, effects=(*actuator.effects, _Added(*changes[4:])))
+            current = driven_current(actuator, drive, line) + changes[3]
+            moved = (x + y for x, y in zip(fields, changes, strict=False))
+            s = finish_chain(changed, line, drive, current, *moved, fields[0], zero, zero)
             found = jnp.fft.rfft(s.reading)[:count] / drive.shape[0]
             return jnp.concatenate([found.real, found.imag[1:]])
 
@@ -122,7 +124,7 @@ def read_rows(template, names, parameters, predictor, marched):
 class Rows:
     """What every line of some recordings, (recordings, lines) of each array, asks of their marches and of what is read.
 
-    `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (6, samples), see `SIGNALS`; `read`:
+    `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (7, samples), see `SIGNALS`; `read`:
     (parameters,), of those behind the march; `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older
     places,), the same of the bottom of the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`:
     (samples, 2), of applied field and current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see
@@ -166,12 +168,12 @@ class Rows:
 
     def of_drive(self, change) -> np.ndarray:
         """The same by a change of the current, A, (columns, recordings, samples)."""
-        asked = self.drive[..., 0] * self.marched.gain[:, None, None] + self.drive[..., 1] + self.signals[:, :, 2]
+        asked = self.drive[..., 0] * self.marched.gain[:, None, None] + self.drive[..., 1] + self.signals[:, :, 3]
         return np.einsum("rln,crn->crl", asked, change, optimize=True)
 
     def of_signals(self, *late) -> np.ndarray:
         """The same by changes of free displacement, displacement and reading, (columns, recordings, samples), or None."""
-        return sum(np.einsum("rln,crn->crl", self.signals[:, :, 3 + k], x, optimize=True) for k, x in enumerate(late) if x is not None)
+        return sum(np.einsum("rln,crn->crl", self.signals[:, :, 4 + k], x, optimize=True) for k, x in enumerate(late) if x is not None)
 
 
 def as_lines(rows) -> np.ndarray:
@@ -195,15 +197,15 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     relay = steps.relay_field[:, -samples:].mean(axis=2)
     for end, slope in zip((relay.argmax(axis=1), relay.argmin(axis=1)), marched.unreached.T, strict=True):
         at[older + count - samples + end, every, 0] += (slope[:, None] * mean)[:, None] / shells
-    asked = np.zeros((count, number, 2, lines))
-    asked[count - samples - 1 : -1] = np.moveaxis(signals[:, :, :2], (3, 2), (0, 2))
+    asked = np.zeros((count, number, 3, lines))
+    asked[count - samples - 1 : -1] = np.moveaxis(signals[:, :, :3], (3, 2), (0, 2))
     through, parameters = np.empty((count, number, added.stop - added.start, lines)), 0.0
     marks = slice(size - steps.ended.shape[3], size)  # states of effects; what the end of a later period asks of them
     later = np.zeros((number, steps.ended.shape[3], lines))
     out, back = np.zeros((number, slopes.shape[3], lines)), np.empty((number, slopes.shape[2], lines))
     for t in range(count - 1, -1, -1):
-        out[:, size:-2] = at[older + t].reshape(number, 2 * shells, lines)
-        out[:, -2:] = asked[t]
+        out[:, size:-3] = at[older + t].reshape(number, 2 * shells, lines)
+        out[:, -3:] = asked[t]
         if (t + 1) % samples == 0:
             out[:, marks] += later
             later = steps.ended[:, t // samples].swapaxes(1, 2) @ out[:, :size]

@@ -27,7 +27,7 @@ def bare(actuator):
 
 @kept
 def trajectory(predictor, actuator):
-    """The march of every recording, per grid: (field, magnetization) of the last period, (recordings, samples), and (relay field,
+    """The march of every recording, per grid: (field, magnetization, its spread) of the last period, (recordings, samples), and (relay field,
     magnetization, coil current, step) of all periods, (recordings, time)."""
 
     def one(drive, dt):
@@ -35,9 +35,10 @@ def trajectory(predictor, actuator):
         memory = actuator.hysteresis.memory(actuator.hysteresis.table(), predictor.corners)
         whole = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
         count = len(current)
-        H, M, v, _, _ = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, period=count)
+        H, M, spread, v, _, _ = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, period=count)
         unreached = actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
-        return (H[-count - 1 : -1], M[-count - 1 : -1] + unreached), (v, M, whole[1], dt)
+        last = slice(-count - 1, -1)
+        return (H[last], M[last] + unreached, spread[last]), (v, M, whole[1], dt)
 
     rows = [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
     return [row[0] for row in rows], [row[1] for row in rows]
@@ -74,9 +75,9 @@ def drive_change(effect, predictor, actuator):
 def signals_of(predictor, actuator, fields):
     """Every signal of the last period of every recording from its `fields`, per grid: `Signals` of (recordings, samples)."""
 
-    def one(drive, dt, H, M):
+    def one(drive, dt, *fields):
         line, zero = Timeline(dt, drive.shape[0], True), jnp.zeros(())
-        return finish_chain(actuator, line, drive, driven_current(actuator, drive, line), H, M, H, zero, zero)
+        return finish_chain(actuator, line, drive, driven_current(actuator, drive, line), *fields, fields[0], zero, zero)
 
     return [jax.vmap(one)(d, t, *f) for d, t, f in zip(predictor.drives, predictor.steps, fields, strict=True)]
 

@@ -190,12 +190,12 @@ class Predictor(eqx.Module):
         return self.lines(actuator, self.march(actuator, levels))
 
     def march(self, actuator, levels=None):
-        """Field and magnetization of every recording, A/m: per grid a pair of (recordings, samples)."""
+        """Field, magnetization and its spread of every recording: per grid three of (recordings, samples)."""
 
         def one(drive, dt, level):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
             line = Timeline(dt, drive.shape[0], True)
-            return march_chain(shifted, line, driven_current(actuator, drive, line), self.periods, self.corners)[:2]
+            return march_chain(shifted, line, driven_current(actuator, drive, line), self.periods, self.corners)[:3]
 
         order = np.asarray(self.index)
         levels = jnp.zeros(len(order)) if levels is None else levels
@@ -229,9 +229,9 @@ class Predictor(eqx.Module):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
             line = Timeline(dt, drive.shape[0], True)
             current = driven_current(actuator, drive, line)
-            H, M = march_chain(shifted, line, current, self.periods, self.corners)[:2]
+            fields = march_chain(shifted, line, current, self.periods, self.corners)[:3]
             zero = jnp.zeros(())
-            reading = finish_chain(actuator, line, drive, current, H, M, H, zero, zero).reading
+            reading = finish_chain(actuator, line, drive, current, *fields, fields[0], zero, zero).reading
             return jnp.fft.rfft(reading)[: self.harmonics + 1] / drive.shape[0]
 
         number, order = jax.tree.leaves(actuators)[0].shape[0], np.asarray(self.index)
@@ -249,10 +249,10 @@ class Predictor(eqx.Module):
     def lines(self, actuator, marched):
         """The reading's coefficients from what `march` gave: the blocks behind the hysteresis."""
 
-        def one(drive, dt, H, M):
+        def one(drive, dt, *fields):
             line = Timeline(dt, drive.shape[0], True)
             zero = jnp.zeros(())
-            signals = finish_chain(actuator, line, drive, driven_current(actuator, drive, line), H, M, H, zero, zero)
+            signals = finish_chain(actuator, line, drive, driven_current(actuator, drive, line), *fields, fields[0], zero, zero)
             return jnp.fft.rfft(signals.reading)[: self.harmonics + 1] / drive.shape[0]
 
         parts = [jax.vmap(one)(d, t, *fields) for d, t, fields in zip(self.drives, self.steps, marched, strict=True)]

@@ -16,7 +16,7 @@ from magjax.chain import Timeline
 from magjax.constants import MU0
 from magjax.effects.learned_term import PAD, LearnedTerm
 from magjax.programs import kept
-from magjax.simulate import run_chain
+from magjax.simulate import driven_current, finish_chain, march_chain
 
 from .adjoint import as_lines
 from .columns import marching, trajectory
@@ -80,13 +80,16 @@ def _signals(predictor, actuator):
     """Every signal of the last period of every recording with its rates, grid by grid."""
 
     def one(drive, dt):
-        s = run_chain(actuator, drive, dt, predictor.periods, predictor.corners)
         line = Timeline(dt, drive.shape[0], True)
+        current = driven_current(actuator, drive, line)
+        marched = march_chain(actuator, line, current, predictor.periods, predictor.corners)
+        s = finish_chain(actuator, line, drive, current, *marched)
         found = {
             "current": s.current,
             "field": s.relay_field,
             "coil_field": s.field,
             "magnetization": s.magnetization if actuator.piezo is None else s.magnetization - actuator.piezo.chi * s.field,
+            "spread": marched[2],
             "reading": s.reading,
         }
         if s.displacement is not None:
@@ -168,7 +171,7 @@ class Tangents:
         self.last = []
         for part, places in self.parts:
             (signals,) = _signals(part, self.actuator)
-            read = passes.read_rows(z, part, (signals["coil_field"], signals["magnetization"]))[0]
+            read = passes.read_rows(z, part, (signals["coil_field"], signals["magnetization"], signals["spread"]))[0]
             self.read.append(np.asarray(read)[: len(places)])
             self.last.append({n: np.asarray(x)[: len(places)] for n, x in signals.items()})
         self.signals = {n: np.concatenate([g[n].ravel() for g in self.last]) for n in self.last[0]}

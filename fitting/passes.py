@@ -81,7 +81,7 @@ class Passes:
     def fields(self, z) -> list:
         """Drive, field H and magnetization M of every recording over a period of the fine grid: [(drive, H, M)], (samples,)."""
         rows = [
-            tuple(np.asarray(x)[k] for x in (part.drives[0], *marched[0]))
+            tuple(np.asarray(x)[k] for x in (part.drives[0], *marched[0][:2]))
             for part, places, marched in self._marched(np.asarray(z, float), self.problem.predictors[1])
             for k in range(len(places))
         ]
@@ -116,7 +116,7 @@ class Passes:
         point = self._point(z)
         for part, places in predictor.batches():
             marched = marched_steps(self.march.actuator, self.march.names, self._of(point, z, part, places), part)
-            read = self.read_rows(z, part, (marched.field, marched.magnetization))
+            read = self.read_rows(z, part, (marched.field, marched.magnetization, marched.spread))
             number = len(places)  # the last is repeated
             yield part, places, rows_of(*(jax.tree.map(lambda x, n=number: np.asarray(x)[:n], k) for k in (marched, *read)))
 
@@ -132,7 +132,7 @@ class Passes:
         return [
             lambda _: self.residual(z),
             lambda _: marched_steps(self.march.actuator, self.march.names, there, part),
-            lambda _: self.read_rows(z, part, (still, still)),
+            lambda _: self.read_rows(z, part, (still, still, still)),
         ]
 
     def _marched(self, z, predictor):

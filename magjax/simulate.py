@@ -77,30 +77,30 @@ def driven_current(actuator, command, line):
 
 
 def march_chain(actuator, line, current, periods: int, corners: int, scheme: str | None = None, until=None):
-    """Coil and hysteresis: field H, magnetization M, relay field, residual (all (time,), A/m), overflow, and how much the last
-    two periods differ; see `run_chain`."""
+    """Coil and hysteresis: field H, magnetization M, its spread, relay field, residual (all (time,), A/m), overflow, and how much
+    the last two periods differ; see `run_chain`."""
     scheme = scheme or actuator.coil.scheme
     count = current.shape[0]
     applied = actuator.coil.applied_field(current)
     table = actuator.hysteresis.table()
     memory = actuator.hysteresis.memory(table, corners)
     if until is None and periods <= 0:
-        H, M, v, residual, overflow = magnetize(actuator, applied, current, line.dt, memory, scheme)
-        return H, M, v, residual, overflow, jnp.zeros(())
+        rows = magnetize(actuator, applied, current, line.dt, memory, scheme)
+        return *rows, jnp.zeros(())
     if until is not None:
         whole = [jnp.append(x, x[:1]) for x in (applied, current)]
         march = march_of(actuator, applied[0], current[0], line.dt, memory, scheme, count)
         *rows, overflow, change = run_until_steady(march, *whole, *until)
-        M_unreached = actuator.hysteresis.unreached(*_range(rows[2]))
-        H, M, v, residual = (jnp.roll(x, 1) for x in rows)  # a period's end is its first sample
+        M_unreached = actuator.hysteresis.unreached(*_range(rows[3]))
+        H, M, spread, v, residual = (jnp.roll(x, 1) for x in rows)  # a period's end is its first sample
     else:
         whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (applied, current)]
         *rows, overflow = magnetize(actuator, *whole, line.dt, memory, scheme, period=count)
-        M_unreached = actuator.hysteresis.unreached(*_range(rows[2][-count:]))
-        H, M, v, residual = (x[-count - 1 : -1] for x in rows)
+        M_unreached = actuator.hysteresis.unreached(*_range(rows[3][-count:]))
+        H, M, spread, v, residual = (x[-count - 1 : -1] for x in rows)
         X = (rows[0] + rows[1])[:-1].reshape(periods, count)
         change = period_change(X[-1], X[-2]) if periods > 1 else jnp.asarray(jnp.inf)
-    return H, M + M_unreached, v, residual, overflow, change
+    return H, M + M_unreached, spread, v, residual, overflow, change
 
 
 def _range(field):
@@ -108,8 +108,8 @@ def _range(field):
     return field[jnp.argmax(stop_gradient(field))], field[jnp.argmin(stop_gradient(field))]
 
 
-def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, unsettled=0.0) -> Signals:
-    """The blocks after the hysteresis: magnetostriction, mechanics, sensor, with their effects."""
+def finish_chain(actuator, line, command, current, H, M, spread, v, residual, overflow, unsettled=0.0) -> Signals:
+    """The blocks after the hysteresis: magnetostriction, mechanics, sensor, with their effects; arguments as from `march_chain`."""
     B = MU0 * (H + M)
     for effect in actuator.effects:
         current = effect.delivered(current, B, line, actuator)
@@ -118,7 +118,7 @@ def finish_chain(actuator, line, command, current, H, M, v, residual, overflow, 
     signals = {"command": command, "current": current, "field": H, "magnetization": M, "flux_density": B}
     free = displacement = None
     if actuator.strained is not None and actuator.output != "polarization":
-        free = actuator.strained(M)
+        free = actuator.strained(M) if actuator.piezo is not None else actuator.strained(M, spread)
         for effect in actuator.effects:
             free = effect.strain(free, M, H, line, actuator)
         displacement = free

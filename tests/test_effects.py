@@ -512,7 +512,7 @@ def test_thresholds_widen_by_the_relays_own_rate_or_by_that_of_the_applied_field
     act = actuator().with_effect(effects.RateDependentSwitching(gamma=gamma, rate0=rate0, of_drive=of_drive))
     applied = act.coil.applied_field(CURRENT)
     memory = act.hysteresis.memory(act.hysteresis.table(), 8)
-    H, _, v, residual, _ = magnetize(act, applied, CURRENT, DT, memory, "bdf2")
+    H, _, _, v, residual, _ = magnetize(act, applied, CURRENT, DT, memory, "bdf2")
     own, driven = np.diff(v) / DT, np.abs(np.diff(applied)) / DT
     rate0 = rate0 + 1e-3
     law = gamma * ((1 - of_drive) * np.arcsinh(own / rate0) + of_drive * np.arcsinh(driven / rate0) * own / np.hypot(own, rate0))

@@ -38,7 +38,7 @@ class _Carry(eqx.Module):
 
 
 class March(NamedTuple):
-    """A march ready to go: the state at the first sample, the row (H, M, relay field, residual) there, and one step."""
+    """A march ready to go: the state at the first sample, the row (H, M, spread, relay field, residual) there, and one step."""
 
     carry: object
     first: tuple
@@ -124,16 +124,17 @@ def _law(actuator, h, scheme, period) -> _Law:
         if given:
             H, M = H + given[0], M + given[1]
         states, marks = _settle(effects, states, c.marks, end, period * h)
-        return _Carry(memory, H + M, c.X0, H, applied1, states, marks, c.before), (H, M, v, residual)
+        return _Carry(memory, H + M, c.X0, H, applied1, states, marks, c.before), (H, M, jnp.zeros_like(v), v, residual)
 
     return _Law(effects, p, q, extra, posed, after)
 
 
 def _at_rest(law: _Law, table, actuator, applied, current, h, memory: Memory):
-    """The state at the first sample, at equilibrium, and the row (H, M, relay field, residual) there."""
+    """The state at the first sample, at equilibrium, and the row (H, M, spread, relay field, residual) there."""
     memory = apply_field(table, memory, applied)
     carry, M = _rested(law, actuator, applied, current, h, memory)
-    return carry, (carry.H0, M, memory.field, jnp.zeros_like(memory.field))
+    zero = jnp.zeros_like(memory.field)
+    return carry, (carry.H0, M, zero, memory.field, zero)
 
 
 def _rested(law: _Law, actuator, applied, current, h, memory: Memory):
@@ -149,7 +150,7 @@ def _rested(law: _Law, actuator, applied, current, h, memory: Memory):
 
 
 def run_march(march: March, applied, current, disturbance=None, period: int = 0):
-    """All samples of a march: field H, magnetization M, relay field, residual, (time,) each, and overflow."""
+    """All samples of a march: field H, magnetization M, its spread, relay field, residual, (time,) each, and overflow."""
     ends = _ends_of_periods(len(applied), period)
     drive = (applied[1:], current[1:], ends, *(d[1:] for d in disturbance or ()))
     carry, rows = jax.lax.scan(march.advance, march.carry, drive)
@@ -163,8 +164,8 @@ def run_until_steady(march: March, applied, current, tolerance, most):
 
     `applied`, `current`: one period and its first sample again, (period + 1,); `march`: of that `period`. It goes on until
     H + M in the second half of a period, behind its extrema, differs from the period before by less than `tolerance` of its
-    peak to peak, or `most` periods are through. Returns field H, magnetization M, relay field, residual, (period,) each,
-    overflow, and the last such difference. Not for reverse-mode derivatives.
+    peak to peak, or `most` periods are through. Returns field H, magnetization M, its spread, relay field, residual,
+    (period,) each, overflow, and the last such difference. Not for reverse-mode derivatives.
     """
     count = len(applied) - 1
     drive = (applied[1:], current[1:], _ends_of_periods(count + 1, count))
@@ -180,7 +181,7 @@ def run_until_steady(march: March, applied, current, tolerance, most):
         change = period_change(X, X0)
         return carry, rows, jnp.where(number > 0, change, jnp.inf), number + 1
 
-    rows = (jnp.zeros(count),) * 4
+    rows = (jnp.zeros(count),) * 5
     carry, rows, change, _ = jax.lax.while_loop(going, again, (march.carry, rows, jnp.asarray(jnp.inf), 0))
     return *rows, carry.memory.overflow.any(), change
 

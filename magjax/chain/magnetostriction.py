@@ -1,6 +1,6 @@
 """Magnetostriction: magnetization M (A/m) -> free displacement u (m) of the rod.
 
-u = l_rod lambda_s (M/M_s)^2, the forcing of T&B (5) divided by w0^2.
+u = l_rod lambda_s mean (M/M_s)^2 over the section, the forcing of T&B (5) divided by w0^2.
 Left out: the fourth power (quartic_magnetostriction), a linear part (linear_strain), hysteresis of its own (strain_hysteresis).
 """
 
@@ -22,6 +22,6 @@ class Magnetostriction(eqx.Module):
         """Free displacement at saturation, l_rod lambda_s, m."""
         return self.l_rod * self.lambda_s
 
-    def __call__(self, magnetization):
-        """Free displacement, m."""
-        return self.reach * (magnetization / self.M_s) ** 2
+    def __call__(self, magnetization, spread=0.0):
+        """Free displacement, m; `spread`: the variance of M over the section, A^2/m^2."""
+        return self.reach * ((magnetization / self.M_s) ** 2 + spread / self.M_s**2)

@@ -22,10 +22,11 @@ from .newton import stop_gradient_trial
 
 
 def magnetize(actuator, applied, current, h, memory: Memory, scheme: str = "trapezoid", disturbance=None, period: int = 0):
-    """March (4) from equilibrium: (field H, magnetization M, relay field, residual, overflow) over time.
+    """March (4) from equilibrium: (field H, magnetization M, its spread, relay field, residual, overflow) over time.
 
     `applied`: c0 I + H_bias, A/m, (time,); `current` the drive, for effects; `h`: step, s; `memory`: the start state.
     The field H is that of (4); the relays see H less the shifts of hysteresis effects. `residual`: A/m, (time,).
+    The spread is what the strain sees of the variance of M over the section, A^2/m^2: of a rod in shells, else zero.
     `disturbance`: what is added at every step as an effect would, (field shift, magnetization, loss), A/m, (time,) each.
     `period`: steps of a period where the drive repeats, else 0: at its ends slow states are led to where they repeat.
     """
@@ -47,7 +48,7 @@ def _derived(scheme, period, given, tangents):
     marched = _marched(scheme, period, *given)
 
     def there(*given):
-        return _replay(scheme, period, stop_gradient(marched[2]), *given)
+        return _replay(scheme, period, stop_gradient(marched[3]), *given)
 
     return marched, (*pushed(there, given, tangents)[1], unmoved(marched[-1]))
 
@@ -93,7 +94,7 @@ def _branches(table, memory: Memory, fields):
 
 
 def _replay(scheme, period, fields, actuator, applied, current, h, memory, disturbance):
-    """The march again, for its derivatives alone: (field H, magnetization M, relay field, residual), (time,) each.
+    """The march again, for its derivatives alone: (field H, magnetization M, its spread, relay field, residual), (time,) each.
 
     `fields`: the relay fields where it ended, frozen. The branches are known then: a step reads the field and M of its
     corner from where the corner arose, and no memory is carried. One Newton step with a frozen slope makes every
@@ -171,14 +172,14 @@ class Steps(eqx.Module):
     """A march to first order, step by step, of a rod in one or more shells. A state of d numbers goes from step to step; (field, M) of a
     shell after a step are a place from which later branches leave, numbered as in `_places`, `before` of them older than the first step.
 
-    `slopes`: (steps, d + 2 shells + 2, d + 3 shells + 5 + parameters), of (state after, relay fields, M of the relays, field H, magnetization)
+    `slopes`: (steps, d + 2 shells + 3, d + 3 shells + 5 + parameters), of (state after, relay fields, M of the relays, field H, magnetization, its spread)
     by (state before, fields and M of the corners, what is added to M of the relays, applied field, current, and the three of a
     disturbance, see `magnetize`, parameters). `place`: (steps, shells), of the corner; `rising`, `threshold`, A/m: of the branch.
     `ended`: (periods, d, states), of the state after the last step of every period by what the states of effects were a period earlier
     (`coupled._settle`); they stand last in a state. `rest`: (d, shells + 2 + parameters), of the first state by (M of the relays, applied
     field, current, parameters).
     `corners`: (2, corners), fields of maxima and minima before the first step; `moved`: (before, 2), of the older places by the applied field
-    of the first sample. `field`, `magnetization`: H and M, (steps + 1,), `relay_field`: (steps + 1, shells), A/m.
+    of the first sample. `field`, `magnetization`, `spread`: H, M and the variance of M over the section, (steps + 1,), `relay_field`: (steps + 1, shells), A/m.
     """
 
     slopes: jax.Array
@@ -191,6 +192,7 @@ class Steps(eqx.Module):
     moved: jax.Array
     field: jax.Array
     magnetization: jax.Array
+    spread: jax.Array
     relay_field: jax.Array
 
 
@@ -214,12 +216,12 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     def advance(carry, drive):
         then, row = march.advance(carry, drive)
         relays = jnp.reshape(jnp.stack([then.memory.field, then.memory.magnetization]), (2, shells))
-        return then, (_flat(carry)[0], ravel_pytree(carry.marks)[0], *relays, *row[:2])
+        return then, (_flat(carry)[0], ravel_pytree(carry.marks)[0], *relays, *row[:3])
 
     ends = _ends_of_periods(len(applied), period)
     flat, marks, *rows = jax.lax.scan(advance, march.carry, (applied[1:], current[1:], ends))[1]
     first = (x * jnp.ones(shells) for x in (memory.field, memory.magnetization))
-    v, m, H, M = (jnp.concatenate([x[None], y]) for x, y in zip((*first, *(x.mean() for x in march.first[:2])), rows, strict=True))
+    v, m, H, M, spread = (jnp.concatenate([x[None], y]) for x, y in zip((*first, *(x.mean() for x in march.first[:3])), rows, strict=True))
     known = jax.vmap(lambda v: _known(table, memory, v), 1, 1)(v)
     older = jnp.broadcast_to(_places(table, memory, 1)[:, :, None], (2 * memory.corners + 2, 2, shells))
     places = jnp.concatenate([older, jnp.stack([v[1:], m[1:]], axis=1)])
@@ -232,8 +234,8 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
         again = _stepping(made(parameters), h, scheme, period)[1]
         before = dataclasses.replace(shaped(flat), marks=shaped_marks(marks))
         v, m, after = again(before, (*drive, end, *disturbance), branch, (x, m))
-        then, (H, M, *_) = after(_Trace(jnp.reshape(v, march.carry.memory.field.shape), None))
-        return jnp.concatenate([_flat(then)[0], jnp.ravel(v), jnp.ravel(m), jnp.stack([H, M])])
+        then, (H, M, spread, *_) = after(_Trace(jnp.reshape(v, march.carry.memory.field.shape), None))
+        return jnp.concatenate([_flat(then)[0], jnp.ravel(v), jnp.ravel(m), jnp.stack([H, M, spread])])
 
     still = jnp.broadcast_to(jnp.concatenate([jnp.zeros(DISTURBED), parameters]), (len(v) - 1, DISTURBED + len(parameters)))
     given = [flat, corner[:, 0], corner[:, 1], jnp.zeros_like(v[1:]), applied[1:, None], current[1:, None], still]
@@ -250,7 +252,7 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     begin = jnp.concatenate([m[0], applied[:1], current[:1], parameters])
     moved = jax.jacfwd(lambda x: _places(table, apply_field(table, start, x), 1))(applied[0])
     ends_of_memory = jnp.stack([memory.maxima, memory.minima])
-    return Steps(slopes, ended, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, v)
+    return Steps(slopes, ended, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, spread, v)
 
 
 class _Rest(NamedTuple):

@@ -7,7 +7,8 @@ By Ampere's and Faraday's laws in a cylinder H_i = applied field - k sum_j D_ij 
     p0 = 1, Q = 3/2 a D / S for the backward formula, p0 = 1/2, Q = a D / S for the trapezoid (a = mu0 k / h):
 the gradient of a strictly convex function of the X_j, piecewise quadratic. It is solved by Newton's method with halved
 steps; one more step with a frozen matrix makes every derivative exact, as in `coupled`.
-Means over the shells go to the blocks behind: what the coil sees and what the rod does as a whole.
+Means over the shells go to the blocks behind: what the coil sees and what the rod does as a whole. Its sections stay plane,
+so that it strains by the mean of M^2: by the square of the mean M and the variance of M over the section, its spread (but for what `alike` takes off it).
 """
 
 from typing import NamedTuple
@@ -79,7 +80,8 @@ def march_of_shells(actuator, share, count: int, applied, current, h, memory, sc
         unlike = _relays(table, c.memory, v)[0] - m  # the relays' own M there: a step that did not settle shows
         return rod.after(c, drive, v, m, moved, unlike)
 
-    return March(carry, (carry.H0, M, memory.field, jnp.zeros_like(memory.field)), advance)
+    zero = jnp.zeros_like(memory.field)
+    return March(carry, (carry.H0, M, zero, memory.field, zero), advance)
 
 
 class _Rod(NamedTuple):
@@ -100,6 +102,7 @@ def _rod(actuator, share, count, h, scheme, period) -> _Rod:
     bdf = scheme == "bdf2"
     a = MU0 * actuator.coil.loss / h
     D = (1 + share * (distribution(count) - 1)) / count
+    seen = next((1 - e.alike for e in actuator.effects if e.shells), 1.0)
     p0, Q = (1.0, 1.5 * a * D) if bdf else (0.5, a * D)
 
     def trial_of(c, current, v, m):
@@ -128,7 +131,7 @@ def _rod(actuator, share, count, h, scheme, period) -> _Rod:
         states, marks = _settle(effects, states, c.marks, end, period * h)
         if given:
             H, M = H + given[0], M + given[1]
-        row = (H.mean(), M.mean(), v.mean(), residual[jnp.argmax(jnp.abs(residual))])
+        row = (H.mean(), M.mean(), seen * M.var(), v.mean(), residual[jnp.argmax(jnp.abs(residual))])
         return _Carry(memory, H + M, c.X0, H, applied1, states, marks), row
 
     return _Rod(effects, p0, Q, posed, after)

@@ -11,7 +11,11 @@ BELOW = 0.02  # step has a solution: least share
 
 
 class FieldDiffusion(AbstractEffect):
-    """Skin effect of a solid cylinder: shells with their own field and relays in place of one loss k dB/dt for all (`chain.shells`)."""
+    """Skin effect of a solid cylinder: shells with their own field and relays in place of one loss k dB/dt for all (`chain.shells`).
+
+    Sections stay plane: the rod strains by the mean of M^2 over the section. In detail a share `alike` of the variance of M is not
+    seen, as where the rod strains by the square of the mean M: a section that magnetizes as one, as lumped models of the skin effect have it.
+    """
 
     kappa: Float[Array, ""] = param(
         0.0,
@@ -24,9 +28,21 @@ class FieldDiffusion(AbstractEffect):
         typical=(0.05, 1.0),
     )
 
+    alike: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "share of the variance of M over the section that the strain does not see",
+        low=0.0,
+        high=1.0,
+        scale=0.5,
+        shape=True,
+        detail=True,
+        typical=(0.0, 1.0),
+    )
+
     name = "field_diffusion"
     block = "coil"
-    law = "k dB/dt -> k [(1 - kappa) mean_j dB_j/dt + kappa mean_j D_ij dB_j/dt] in shell i, D_ij = mean of -2 ln max(u, u'), u = (r/R)^2"
+    law = "k dB/dt -> k [(1 - kappa) mean_j dB_j/dt + kappa mean_j D_ij dB_j/dt] in shell i, D_ij = mean of -2 ln max(u, u'), u = (r/R)^2; strain by mean m^2, in detail less alike var m"
     source = "Ampere's and Faraday's laws in a conducting cylinder: J. Lammeraner, M. Stafl, Eddy Currents, 1966"
     signature = (
         "the eddy lag grows more slowly than frequency, and the skin switches ahead of the core: rounded corners at high frequency"
