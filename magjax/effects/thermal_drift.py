@@ -30,8 +30,13 @@ class ThermalDrift(AbstractEffect):
     record_level = True
 
     def reading(self, reading, signals, line, actuator):
-        """Reading with the expansion over the record's time; the current runs straight between samples of its square."""
+        """Reading with the expansion over the record's time; the square of the current runs straight between samples."""
         heat, kept = signals["current"] ** 2, jnp.exp(-line.dt / self.tau)
         steps = self.tau * (1 - kept) * (heat[1:] + heat[:-1]) / 2
-        warm = jax.lax.associative_scan(lambda a, b: (a[0] * b[0], a[1] * b[0] + b[1]), (jnp.full_like(steps, kept), steps))[1]
-        return reading + self.rate * jnp.concatenate([jnp.zeros(1), warm])
+
+        def warm(theta, step):
+            theta = kept * theta + step
+            return theta, theta
+
+        _, theta = jax.lax.scan(warm, jnp.zeros(()), steps)
+        return reading + self.rate * jnp.concatenate([jnp.zeros(1), theta])
