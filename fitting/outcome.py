@@ -53,6 +53,7 @@ def recording_fits(problem, residual, recordings, bench):
         misfit = np.where(finite, deviations[k], 0.0)
         power = (real[k] * misfit) ** 2
         power[1:] = 2 * (power[1:] + (imag[k] * misfit[1:]) ** 2)
+        power[0] *= not s.zero  # a zero of its own is no error
         between = float(np.mean(s.residue**2))
         rows.append(
             RecordingFit(

@@ -102,10 +102,14 @@ def pulsation_lines(s) -> np.ndarray:
     return np.where(orders > 0, heat / (2j * np.pi * np.maximum(orders, 1) * s.frequency), 0.0)
 
 
+def pulsation(s) -> np.ndarray:
+    """The same over the samples of a record."""
+    return evaluate_lines(pulsation_lines(s), s.dt * s.frequency * np.arange(s.samples))
+
+
 def pulsation_of(spectra, z: float, rate: float, error: float) -> RecordEffect:
     """The pulsation of the heat within the period, known from the harmonics (`on_lines.heat_score`)."""
-    columns = tuple(evaluate_lines(pulsation_lines(s), s.dt * s.frequency * np.arange(s.samples)) for s in spectra)
-    return RecordEffect("thermal_drift", z, rate, error, {"pulsation": True}, columns)
+    return RecordEffect("thermal_drift", z, rate, error, {"pulsation": True}, tuple(pulsation(s) for s in spectra))
 
 
 def zeros_of(spectra, z: float, zeros, errors, adopted=()) -> list[RecordEffect]:
@@ -261,7 +265,7 @@ def remove_from_checks(recordings, adopted, bench):
             elif effect.shapes.get("own"):
                 columns = (drift_of(spectra[0])[1],)
             elif effect.shapes.get("pulsation"):
-                columns = pulsation_of(spectra, effect.z, effect.amplitude, effect.stderr).columns
+                columns = (pulsation(spectra[0]),)
             else:
                 same = [c for n, shapes, c in record_columns([recording], spectra) if (n, shapes) == (effect.name, effect.shapes)]
                 columns = tuple(same[0])

@@ -9,6 +9,7 @@ import pytest
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.own_signals import heat_on_harmonics, record_level
+from fitting.report.evidence import model_misfit
 from fitting.setup import Choices, spectra_of
 from fitting.task import Task
 from magjax.bench import load_bench
@@ -71,6 +72,9 @@ def test_what_pulses_with_the_heat_is_heat_and_no_zero_that_drifts():
     pulsation = next(e for e, _ in told if e.shapes.get("pulsation"))
     assert pulsation.amplitude == pytest.approx(WINDING[0] + ROD[0], rel=0.15)
     assert heat_on_harmonics(cleaned, told, freed) is None
+    for misfit, spectrum in zip(model_misfit(freed), freed.problem.spectra, strict=True):  # drawn at the level that each has
+        assert 2 * np.sum(np.abs(misfit) ** 2) < (0.5 * spectrum.noise_rms) ** 2
+    assert all(r.residual_rms < 1.2 * r.noise_rms for r in freed.recordings)
 
 
 def test_a_drift_that_does_not_pulse_is_not_said_to():

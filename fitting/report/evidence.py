@@ -57,12 +57,14 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
 
 
 def model_misfit(result) -> np.ndarray:
-    """Fourier coefficients of model less measurement, (recordings, harmonics + 1), unit of the reading."""
+    """Fourier coefficients of model less measurement, (recordings, harmonics + 1), unit of the reading; without the mean of a
+    recording that has a zero of its own."""
     problem = result.problem
     residual = data_residual(problem, result.solution.z)
     R, H = problem.target.lines.shape
     misfit = residual[: R * H].reshape(R, H).astype(complex)
     misfit[:, 1:] += 1j * residual[R * H :].reshape(R, H - 1)
+    misfit[[s.zero > 0 for s in problem.spectra], 0] = 0.0
     deviations = np.asarray(problem.target.deviations)
     return misfit * np.where(np.isfinite(deviations), deviations, 0.0)
 

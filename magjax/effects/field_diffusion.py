@@ -29,15 +29,7 @@ class FieldDiffusion(AbstractEffect):
     )
 
     alike: Float[Array, ""] = param(
-        0.0,
-        "1",
-        "share of the variance of M over the section that the strain does not see",
-        low=0.0,
-        high=1.0,
-        scale=0.5,
-        shape=True,
-        detail=True,
-        typical=(0.0, 1.0),
+        0.0, "1", "share of the variance of M that the strain does not see", low=0.0, high=1.0, scale=0.5, shape=True, detail=True, typical=(0.0, 1.0)
     )
 
     name = "field_diffusion"

@@ -18,7 +18,7 @@ FIT = {
     "recordings[].frequency": "fundamental of the drive, Hz",
     "recordings[].periods": "whole periods in the recording",
     "recordings[].noise_rms": "noise of one sample, from what lies between the harmonics",
-    "recordings[].residual_rms": "rms of measured minus simulated",
+    "recordings[].residual_rms": "rms of measured minus simulated, without the mean of a recording that has a zero of its own",
     "recordings[].chi2_per_sample": "misfit of this recording in units of its noise; 1: nothing left to explain",
     "parameters": "every scalar parameter of the model, by its full name (parameters.md)",
     "parameters.*": "e.g. coil.R_eddy, effects.sensor_lag.tau",
