@@ -140,18 +140,19 @@ def test_a_share_beyond_its_range_still_has_steps():
 
 
 @pytest.mark.long
-def test_the_screening_scores_it_at_its_finite_size():
+@pytest.mark.parametrize(("alike", "shapes"), [(0.0, {}), (1.0, {"alike": 1.0})])
+def test_the_screening_scores_it_at_its_finite_size_in_the_form_that_serves(alike, shapes):
     from fitting.demo import concealed_actuator, record
     from fitting.fit import fit
     from fitting.screen import screen
     from fitting.setup import Choices
     from magjax.bench import load_bench
 
-    truth = concealed_actuator(load_bench("aa-050h")).with_effect(effects.FieldDiffusion(kappa=0.6))
+    truth = concealed_actuator(load_bench("aa-050h")).with_effect(effects.FieldDiffusion(kappa=0.6, alike=alike))
     rng = np.random.default_rng(0)
     runs = [record(truth, f, a, 0.05, rng, f"{f}") for f, a in ((10, 0.8), (40, 0.4), (100, 0.8), (200, 0.4), (300, 0.8))]
     found = fit(runs, load_bench("aa-050h"), choices=Choices(fine=250, knots=(12, 9), level=48, rest="negative"), refine=False)
     scores = {c.name: c for c in screen(found.problem, found.refined)}
     best = scores["field_diffusion"]
     assert best.tried_at == best.amplitude == best.smallest_visible and scores["creep"].tried_at is None
-    assert best.z > 5 and best.amplitude == 0.5 and not best.shapes
+    assert best.z > 5 and best.amplitude == 0.5 and best.shapes == shapes

@@ -45,8 +45,8 @@ class FieldDiffusion(AbstractEffect):
 
     @classmethod
     def finite_trials(cls, drives, steps):
-        """The mean field and magnetization do not change to first order: scored where the skin leads."""
-        return [{"kappa": 0.5}]
+        """The mean field and magnetization do not change to first order: scored where the skin leads, in either form of the strain."""
+        return [{"kappa": 0.5}, {"kappa": 0.5, "alike": 1.0}]
 
     def share(self):
         """The share in use: `kappa`, kept between -BELOW and 1."""
