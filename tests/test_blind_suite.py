@@ -207,6 +207,7 @@ def ended(process, patience_s: float = 10.0) -> bool:
     return False
 
 
+@pytest.mark.long
 def test_a_killed_worker_costs_its_case_only(tmp_path):
     """A command that kills its worker at first, for one of two cases: it ends with the worker, and the case is run again."""
     (tmp_path / "command.py").write_text(STAND_IN)

@@ -127,8 +127,9 @@ def test_names_a_concealed_sensor_filter(bench):
 
 @pytest.mark.parametrize(
     ("ends", "said", "named"),
-    [pytest.param("at once", "unknown_at", [], marks=pytest.mark.long), ("after the leaders", "attributed", ["sensor_lag"])],
+    [("at once", "unknown_at", []), ("after the leaders", "attributed", ["sensor_lag"])],
 )
+@pytest.mark.long
 def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, ends, said, named):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
     asked = {"sensor_lag", "transport_delay"}

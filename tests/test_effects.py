@@ -188,6 +188,7 @@ def test_a_strong_spring_of_a_lightly_damped_rod_against_its_equation_in_time(ef
     assert np.abs(np.asarray(found) - exact).max() < (1e-6 if periodic else 1e-4) * np.ptp(exact)
 
 
+@pytest.mark.long
 def test_a_rod_that_sticks_stays_calm_on_a_coarse_grid():
     act = dataclasses.replace(actuator(20), mechanics=Mechanics(jnp.asarray(400.0), jnp.asarray(0.1)))
     effect = effects.CoulombFriction(f=1.2e-6, v_s=1e-6, presliding=1.5e-7)

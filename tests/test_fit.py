@@ -192,6 +192,7 @@ def test_masses_that_are_not_free_are_held(recordings, bench, result):
         fit([beyond], held, actuator=off)
 
 
+@pytest.mark.long
 def test_a_positive_parameter_stays_within_thirty_times_of_the_bench(recordings, bench, result):
     layout = result.problem.layout
     assert float(layout.highs[layout.names.index("coil.R_eddy")]) == pytest.approx(30 * bench.constants["coil.R_eddy"])

@@ -106,7 +106,7 @@ def test_so_they_are_of_a_rod_in_shells(beside):
 
 @pytest.mark.parametrize(
     "effect",
-    [effects.MagneticAftereffect(share=0.02), pytest.param(effects.SecondEddyPath(kappa=0.3), marks=pytest.mark.long)],
+    [pytest.param(e, marks=pytest.mark.long) for e in (effects.MagneticAftereffect(share=0.02), effects.SecondEddyPath(kappa=0.3))],
     ids=lambda e: e.name,
 )
 def test_so_they_are_of_states_that_are_led_to_where_they_repeat(effect):
@@ -117,6 +117,7 @@ def test_so_they_are_of_states_that_are_led_to_where_they_repeat(effect):
     assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
 
 
+@pytest.mark.long
 def test_so_they_are_where_an_effect_reads_the_masses():
     """The slope of the switching is that of all masses over the plane: without it the density's columns are 0.6 % off."""
     found, expected = along_some_directions(effects.RateDependentSwitching(gamma=200.0, of_flux=0.9))
