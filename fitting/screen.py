@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from magjax.constants import MU0
 from magjax.effects import CATALOGUE
 
 from .adjoint import as_lines
@@ -167,8 +168,9 @@ def columns(problem, z):
     actuator = problem.layout.actuator(problem.template, np.asarray(z))
     predictor = problem.predictors[0]
     classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
-    drives = [np.asarray(d) for d in predictor.drives]
-    trials, lines = {c: c.finite_trials(drives, predictor.steps) for c in classes}, []
+    rows = [(d[None], MU0 * (H + M)[None], [1 / (s.frequency * len(d))]) for (d, H, M), s in zip(problem.passes.fields(z), problem.spectra, strict=True)]
+    drives, fluxes, steps = zip(*rows, strict=True)
+    trials, lines = {c: c.finite_trials(drives, steps, fluxes) for c in classes}, []
     for part, _, rows in problem.passes.rows(z):
         asked, found = _changes(classes, trials, part, actuator, rows, reading_range(problem.spectra))
         lines.append(found)

@@ -44,15 +44,18 @@ class AmplifierClipping(AbstractEffect):
     in_step = True
 
     @classmethod
-    def finite_trials(cls, drives, steps):
-        """Limits at which to score it: parameters for shares of the largest voltage that the drives ask for."""
+    def finite_trials(cls, drives, steps, fluxes):
+        """Limits at which to score it: parameters for shares of the largest voltage that the drives ask for, which the coil's own
+        flux makes, or that of the rod: then it is the hysteresis that runs into the limit, and no share of dI/dt looks like it."""
         found = []
-        for tau in (0.0, 1e-3, 4e-3):
+        for tau, linkage in ((0.0, 0.0), (1e-3, 0.0), (4e-3, 0.0), (1e-3, 3e-3), (1e-3, 3e-2)):
             peak = 0.0
-            for drive, dt in zip(drives, steps, strict=True):
-                rate = (np.roll(drive, -1, axis=-1) - np.roll(drive, 1, axis=-1)) / (2 * np.asarray(dt)[:, None])
-                peak = max(peak, float(np.max(np.abs(drive + tau * rate))))
-            found += [{"tau_L": tau, "inverse_limit": 1 / (share * peak)} for share in (0.97, 0.9, 0.75)]
+            for drive, flux, dt in zip(drives, fluxes, steps, strict=True):
+                linked = tau * drive + linkage * flux
+                rate = (np.roll(linked, -1, axis=-1) - np.roll(linked, 1, axis=-1)) / (2 * np.asarray(dt)[:, None])
+                peak = max(peak, float(np.max(np.abs(drive + rate))))
+            behind = {"linkage": linkage} if linkage else {}
+            found += [{"tau_L": tau, **behind, "inverse_limit": 1 / (share * peak)} for share in (0.97, 0.9, 0.75)]
         return found
 
     def _current(self, command, before, flux_rate, h):
