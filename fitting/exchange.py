@@ -89,6 +89,12 @@ def exchange(task, state, check=()):
         _exchanged(task, state, len(state.steps) - 1)
 
 
+def both_found(steps) -> list:
+    """The steps; none has a rival that another has adopted: what was not told apart alone is there beside it."""
+    adopted = {step[0].name for step in steps}
+    return [(best, [t for t in rivals if t.name == best.name or t.name not in adopted], good, previous) for best, rivals, good, previous in steps]
+
+
 def _exchanged(task, state, index, check=()) -> bool:
     """The best of an effect adopted and its near rivals, beside all others; whether it is another."""
     best, _, good, previous = state.steps[index]

@@ -36,7 +36,7 @@ from .attribute import (
 )
 from .check import check_errors
 from .diagnosis import SILENT_CHI2
-from .exchange import backward, commuted, exchange
+from .exchange import backward, both_found, commuted, exchange
 from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, finest, hats_of_step
 from .foretold import Foreteller
 from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
@@ -100,19 +100,24 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
     try:
         task, made_up, needless = _forward(task, base, state, candidates, check, ends, free_means)
         state.under_way = {}
-        if needless:
-            return state
-        if state.current.chi2_per_sample < FAR_FROM_NOISE:
-            backward(task, state, made_up)
-            exchange(task, state, check)
-            if commuted(task, state, scored.get("sensor_lag")):
-                exchange(task, state, check)
-        if state.steps and state.current is not state.steps[-1][0].result:
-            ends(state.current)
+        if not needless:
+            _once_more(task, state, made_up, scored, check, ends)
     except Late:
         state.late = True
         state.partial = _adopt_of(state, base, check) or not state.steps
+    state.steps = both_found(state.steps)
     return state
+
+
+def _once_more(task, state, made_up, scored, check, ends):
+    """What was adopted, once more beside what came later."""
+    if state.current.chi2_per_sample < FAR_FROM_NOISE:
+        backward(task, state, made_up)
+        exchange(task, state, check)
+        if commuted(task, state, scored.get("sensor_lag")):
+            exchange(task, state, check)
+    if state.steps and state.current is not state.steps[-1][0].result:
+        ends(state.current)
 
 
 def _forward(task, base, state, candidates, check, ends, free_means):

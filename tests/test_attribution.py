@@ -12,6 +12,7 @@ import fitting.search
 import fitting.verdict
 from fitting.attribute import Trial, _physical, chi2_of, confidence, excess_of, family, leaders, rivals_of, tie_of
 from fitting.diagnosis import Evidence
+from fitting.exchange import both_found
 from fitting.record_level import RecordEffect
 from fitting.report.diagnosis_page import _size
 from fitting.rows import behind, creeps_on, sizes_of, ties_of
@@ -136,6 +137,14 @@ def test_a_group_is_told_in_a_sentence(groups, said):
     whole, cut = (SimpleNamespace(excess=1.0, command_only=False, reached=SimpleNamespace(partial=p)) for p in (False, True))
     assert _grouped(whole, {}, [], groups, [], None, None).message == said
     assert _grouped(cut, {}, [], groups, [], None, None).message == f"{said} Not all rivals were fitted."
+
+
+def test_what_is_found_beside_an_effect_is_no_rival_of_it():
+    """Under the misfit of the first alone the two are not told apart."""
+    limit, friction, mode = trial("amplifier_clipping", 26.0, base=121.0), trial("coulomb_friction", 27.0, base=121.0), trial("second_mode", 26.5)
+    beside = trial("coulomb_friction", 0.9, base=26.0)
+    first, second = both_found([(limit, [limit, friction, mode], [], None), (beside, [beside], [], limit.result)])
+    assert names(first[1]) == ["amplifier_clipping", "second_mode"] and names(second[1]) == ["coulomb_friction"]
 
 
 def test_rivals_where_the_best_is_not_the_whole_truth():
