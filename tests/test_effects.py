@@ -115,6 +115,18 @@ def test_a_limited_voltage_bounds_the_current(linkage):
     assert (linkage > 0) == (np.abs(current - np.asarray(other)).max() > 1e-3)
 
 
+def test_a_round_limit_is_a_hyperbola_about_the_hard_one():
+    command, limit = np.asarray(CURRENT), 0.6
+    delivered = [
+        np.asarray(run_chain(actuator(20).with_effect(effects.AmplifierClipping(inverse_limit=1 / limit, tau_L=0.0, softness=s)), CURRENT, DT, 4, 2).current)
+        for s in (0.0, 1e-6, 0.1)
+    ]  # fmt: skip
+    u = command / limit
+    assert np.abs(u).max() > 1.1 and np.array_equal(delivered[0], np.clip(command, -limit, limit))
+    assert np.abs(delivered[1] - delivered[0]).max() < 1e-6 * limit
+    assert delivered[2] == pytest.approx(limit * (np.hypot(u + 1, 0.1) - np.hypot(u - 1, 0.1)) / 2, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     "f,v_s,presliding,stribeck,tolerance",
     [(4e-7, 1e-7, 3e-7, 0, 0.02), (4e-7, 1e-7, 2e-6, 0, 0.02), (4e-7, 1e-3, 1e-8, 0, 0.03), (2e-6, 1e-5, 1e-7, 0, 0.02)]

@@ -17,7 +17,7 @@ class AmplifierClipping(AbstractEffect):
 
     The exact law, inside the step of (4), for the flux answers the current; L is of what the rod does not fill. With g = R / V_max a
     limit that nothing reaches is no limit, so there is no derivative at null: the screening tries limits just below what the
-    recordings ask for. In detail the flux of the rod counts, which otherwise tau_L stands for.
+    recordings ask for. In detail the flux of the rod counts, which otherwise tau_L stands for, and the limit may be round.
     """
 
     inverse_limit: Float[Array, ""] = param(
@@ -34,9 +34,23 @@ class AmplifierClipping(AbstractEffect):
         0.0, "A s/T", "turns times area over resistance", low=0.0, scale=5e-3, shape=True, detail=True, typical=(1e-3, 5e-2)
     )
 
+    softness: Float[Array, ""] = param(
+        0.0,
+        "1",
+        "width over which the limit is round, of the limit (a hyperbola)",
+        low=0.0,
+        scale=0.05,
+        shape=True,
+        detail=True,
+        typical=(0.0, 0.3),
+    )
+
     name = "amplifier_clipping"
     block = "source"
-    law = "|I + tau_L dI/dt + linkage dB/dt| <= 1 / g, I = command wherever that allows it"
+    law = (
+        "|I + tau_L dI/dt + linkage dB/dt| <= 1 / g, I = command wherever that allows it; with softness s the voltage asked for, over its limit, "
+        "u becomes (sqrt((u + 1)^2 + s^2) - sqrt((u - 1)^2 + s^2)) / 2"
+    )
     source = "voltage compliance of a linear amplifier, |L dI/dt + R I + N A dB/dt| <= V_max"
     signature = "flattened crests at the largest amplitude, at high frequency first; nothing below the limit"
     amplitude = "inverse_limit"
@@ -46,7 +60,8 @@ class AmplifierClipping(AbstractEffect):
     @classmethod
     def finite_trials(cls, drives, steps, fluxes):
         """Limits at which to score it: parameters for shares of the largest voltage that the drives ask for, which the coil's own
-        flux makes, or that of the rod: then it is the hysteresis that runs into the limit, and no share of dI/dt looks like it."""
+        flux makes, or that of the rod, with a limit a little round: then it is the hysteresis that runs into it, and no share of dI/dt
+        looks like that."""
         found = []
         for tau, linkage in ((0.0, 0.0), (1e-3, 0.0), (4e-3, 0.0), (1e-3, 3e-3), (1e-3, 3e-2)):
             peak = 0.0
@@ -54,7 +69,7 @@ class AmplifierClipping(AbstractEffect):
                 linked = tau * drive + linkage * flux
                 rate = (np.roll(linked, -1, axis=-1) - np.roll(linked, 1, axis=-1)) / (2 * np.asarray(dt)[:, None])
                 peak = max(peak, float(np.max(np.abs(drive + rate))))
-            behind = {"linkage": linkage} if linkage else {}
+            behind = {"linkage": linkage, "softness": 0.02} if linkage else {}
             found += [{"tau_L": tau, **behind, "inverse_limit": 1 / (share * peak)} for share in (0.97, 0.9, 0.75)]
         return found
 
@@ -62,7 +77,10 @@ class AmplifierClipping(AbstractEffect):
         limit = 1 / jnp.maximum(self.inverse_limit, 1 / NO_LIMIT)
         a = self.tau_L / h
         middle, room = (a * before - self.linkage * flux_rate) / (1 + a), limit / (1 + a)
-        return jnp.clip(command, middle - room, middle + room)
+        u, round_ = (command - middle) / room, self.softness > 0
+        width = jnp.where(round_, self.softness, 1.0) ** 2
+        soft = middle + 0.5 * room * (jnp.sqrt((u + 1) ** 2 + width) - jnp.sqrt((u - 1) ** 2 + width))
+        return jnp.where(round_, soft, jnp.clip(command, middle - room, middle + room))
 
     def start(self, trial, actuator):
         """(current, field that it falls short of) at rest."""
