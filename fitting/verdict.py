@@ -281,4 +281,14 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
         f"{max(evidence.share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."
     )
     unknown = {"block": block, "region": region, "explained_share": float(np.clip(evidence.share, 0, 1))}
-    return Diagnosis("unknown_at", text + note, unknown=unknown, **common)
+    effects, groups = _beside_the_loop(evidence)
+    if effects or groups:
+        names = " and ".join([*(e["name"] for e in effects), *(" or ".join(g) for g in groups)])
+        note += f" Found beside it, in what does not repeat with the drive: {names}."
+    return Diagnosis("unknown_at", text + note, tuple(effects), tuple(groups), unknown=unknown, **common)
+
+
+def _beside_the_loop(evidence):
+    """What the records alone show, whatever the loops hold: effects and groups."""
+    plain = dataclasses.replace(evidence.reached, steps=[])
+    return found_rows(dataclasses.replace(evidence, reached=plain))[:2]
