@@ -151,7 +151,7 @@ def cut_in_noise(x: np.ndarray) -> tuple[int, int] | None:
         return None
     at_top = np.flatnonzero(x == x.max())
     near = np.unique(x[(x < x.max()) & (x > x.max() - 4 * noise)], return_counts=True)[1]
-    if len(at_top) < max(TIED, TIED_MORE * near.max(initial=1)):
+    if not len(near) or len(at_top) < max(TIED, TIED_MORE * near.max()):  # a step of a staircase has nothing near below it
         return None
     return max(_runs(x == x.max()), key=lambda run: run[1])
 

@@ -48,6 +48,7 @@ def study(bench, effect=None, seed=5):
     return [record(truth, *d, rng, f"r{d[0]}") for d in DRIVES], [record(truth, 400, 0.6, 0.05, rng, "c400")]
 
 
+@pytest.mark.long
 def test_silent_where_nothing_is_missing(bench):
     runs, checks = study(bench)
     found = diagnose(runs, bench, check=checks)

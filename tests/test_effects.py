@@ -216,7 +216,7 @@ def test_a_rod_that_sticks_stays_calm_on_a_coarse_grid():
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.04 * np.sqrt(np.mean(fine**2))
 
 
-@pytest.mark.parametrize("frequency", [10.7, 175.0])
+@pytest.mark.parametrize("frequency", [pytest.param(10.7, marks=pytest.mark.long), 175.0])
 def test_strong_friction_of_a_little_damped_rod_is_settled(frequency, monkeypatch):
     """The rod goes on swinging after each turn: a slow drive's samples are too few for it, a fast one's period too short."""
     from magjax.effects import coulomb_friction as module

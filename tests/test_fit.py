@@ -546,6 +546,7 @@ def test_a_reading_that_is_negative_throughout_starts_without_a_warning(recordin
     assert np.isfinite(x).all() and np.isfinite([bottom, misfit]).all()
 
 
+@pytest.mark.long
 def test_loops_whose_strain_does_not_come_back_to_zero_are_begun_with_its_sign_turned(tmp_path):
     """A reading 0.3 um off, as friction or a strain that lags leaves it: M seemed to stay positive, and no density meets that."""
     text = Path(magjax.bench.__file__).with_name("benches").joinpath("aa-050h.toml").read_text()

@@ -30,6 +30,7 @@ def recorded(hum=0.0, drives=DRIVES, only=None):
     return rows
 
 
+@pytest.mark.long
 def test_nothing_scores_on_harmonics_of_the_mains_without_hum():
     base = fit(recorded(), BENCH, refine=False)
     z, tones = hum_score(base.problem, base.refined)

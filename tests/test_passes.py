@@ -96,7 +96,8 @@ def along_some_directions(*held):
     return directions @ data_jacobian(problem, z).T, np.asarray(pushed(directions))
 
 
-@pytest.mark.parametrize("beside", [(), pytest.param((effects.MagneticAftereffect(share=0.02),), marks=pytest.mark.long)], ids=len)
+@pytest.mark.long
+@pytest.mark.parametrize("beside", [(), (effects.MagneticAftereffect(share=0.02),)], ids=len)
 def test_so_they_are_of_a_rod_in_shells(beside):
     found, expected = along_some_directions(effects.FieldDiffusion(kappa=0.7), *beside)
     largest = np.abs(expected).max(axis=1)
@@ -164,6 +165,7 @@ def test_another_study_asks_for_no_other_programs(traced):
     assert np.array_equal(data_jacobian(problem, z), data_jacobian(dataclasses.replace(problem, predictors=(coarse, coarse)), z))
 
 
+@pytest.mark.long
 def test_nor_does_its_screening(traced, monkeypatch):
     """Of an effect before the hysteresis, one in the source, one behind it."""
     kinds = [effects.SecondEddyPath, effects.AmplifierLag, effects.StrainHysteresis]

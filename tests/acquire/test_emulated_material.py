@@ -68,6 +68,7 @@ def test_a_reversal_after_a_run_starts_where_that_one_ended(bench):
     assert np.abs(got - whole[-2 * WIDTH :]).max() < 5e-3 * np.ptp(whole)
 
 
+@pytest.mark.long
 def test_demagnetizing_between_runs_takes_the_past_away(bench):
     after = {}
     for clean in (False, True):

@@ -103,6 +103,7 @@ def test_refits_side_by_side_are_those_one_by_one(result):
     assert lost.converged and lost.jacobians and lost.chi2 == pytest.approx(alone[0].chi2, rel=1e-3)
 
 
+@pytest.mark.long
 def test_lines_of_each_on_several_grids(result):
     """Two grids whose recordings stand in another order among all, and levels of their own."""
     one, problem = result.problem.predictors[1], result.problem
