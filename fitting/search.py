@@ -59,7 +59,6 @@ FORM_ERROR = 0.005  # of what the effects found take: as little as that is left 
 WHOLE = 1.0, 0.9  # unless it ends at this chi2/N and takes that share of a misfit: another law seldom has just their form
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
-LIKE_FORM = 0.01  # the same where the noise is met already: less needs check recordings that say for it
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7; check recordings
 # that say for it count as much
 
@@ -194,8 +193,7 @@ def _not_confirmed(state, best, excess, check) -> bool:
     further = state.steps and check and not _decides(state.current, best, excess)
     if further and _predicts_worse(state.current, best.result, state.foretell):
         return True
-    unsure = state.unsure or _calm(state) and best.drop < LIKE_FORM * (chi2_of(state.steps[0][3]) - chi2_of(state.current))
-    return unsure and best.drop + _confirmed(state.current, best.result, state.foretell) < SECOND_Z**2
+    return state.unsure and best.drop + _confirmed(state.current, best.result, state.foretell) < SECOND_Z**2
 
 
 def _adopt_of(state, base, check) -> bool:

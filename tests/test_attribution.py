@@ -615,19 +615,6 @@ def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypat
 
 
 @pytest.mark.parametrize(
-    ("base", "says", "refused"), [(15.0, None, True), (15.0, -9.0, True), (15.0, 30.0, False), (2.0, None, False)],
-    ids=["no check", "not confirmed", "confirmed", "no small share"],
-)  # fmt: skip
-def test_a_small_share_of_what_was_found_is_named_where_check_recordings_say_for_it(base, says, refused):
-    """Where the noise is met already: a delta_e of another form left a hundredth of its fall, and a quartic law took it at z of 8."""
-    first, second = trial("delta_e", 0.99, base=base), trial("quartic_magnetostriction", 0.85, base=0.99)
-    plain = SimpleNamespace(chi2_per_sample=base, data_count=COUNT)
-    foretell = SimpleNamespace(says_for=lambda after, before: says)
-    state = Reached(first.result, [(first, [first], [first], plain)], {}, foretell=foretell)
-    assert fitting.search._not_confirmed(state, second, 40.0, ()) is refused
-
-
-@pytest.mark.parametrize(
     ("value", "left", "kept"), [(0.001, 1.05, 1), (0.001, 1.6, 2), (0.5, 1.05, 2)], ids=["nothing", "needed", "seen"]
 )
 def test_the_last_effect_is_dropped_where_it_has_come_out_as_nothing(value, left, kept):
