@@ -168,9 +168,10 @@ def columns(problem, z):
     actuator = problem.layout.actuator(problem.template, np.asarray(z))
     predictor = problem.predictors[0]
     classes = [c for c in applicable(actuator, problem.quasistatic) if not c.record_level]
-    rows = [(d[None], MU0 * (H + M)[None], [1 / (s.frequency * len(d))]) for (d, H, M), s in zip(problem.passes.fields(z), problem.spectra, strict=True)]
-    drives, fluxes, steps = zip(*rows, strict=True)
-    trials, lines = {c: c.finite_trials(drives, steps, fluxes) for c in classes}, []
+    drives, H, M = zip(*problem.passes.fields(z), strict=True)
+    fluxes = [MU0 * (h + m) for h, m in zip(H, M, strict=True)]
+    steps = [1 / (s.frequency * len(drive)) for s, drive in zip(problem.spectra, drives, strict=True)]
+    trials, lines = {c: c.finite_trials(drives, fluxes, steps) for c in classes}, []
     for part, _, rows in problem.passes.rows(z):
         asked, found = _changes(classes, trials, part, actuator, rows, reading_range(problem.spectra))
         lines.append(found)

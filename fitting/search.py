@@ -254,7 +254,8 @@ def _trials(task, current, top, candidates, excess, under_way) -> list[Trial]:
     if best and best.explained_share < IMITATES and best.result.chi2_per_sample > FAR_FROM_NOISE:
         # none takes most: a strong effect may act unlike its derivative at null
         known = {t.name for t in trials} | {c.name for c in like}
-        like += [c for c in candidates if c.name not in known and abs(c.z) > (Z_THRESHOLD if c.name in THRESHOLDS else least) and c.visibility > 1e-3]
+        others = [c for c in candidates if c.name not in known and c.visibility > 1e-3]
+        like += [c for c in others if abs(c.z) > (Z_THRESHOLD if c.name in THRESHOLDS else least)]
     if best:
         known = {t.name for t in trials} | {c.name for c in like}
         like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]

@@ -281,14 +281,11 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
         f"{max(evidence.share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."
     )
     unknown = {"block": block, "region": region, "explained_share": float(np.clip(evidence.share, 0, 1))}
-    effects, groups = _beside_the_loop(evidence)
+    # what the records alone show stands whatever the loops hold
+    records = dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, steps=[]))
+    effects, groups, sizes, _ = found_rows(records)
     if effects or groups:
         names = " and ".join([*(e["name"] for e in effects), *(" or ".join(g) for g in groups)])
         note += f" Found beside it, in what does not repeat with the drive: {names}."
-    return Diagnosis("unknown_at", text + note, tuple(effects), tuple(groups), unknown=unknown, **common)
-
-
-def _beside_the_loop(evidence):
-    """What the records alone show, whatever the loops hold: effects and groups."""
-    plain = dataclasses.replace(evidence.reached, steps=[])
-    return found_rows(dataclasses.replace(evidence, reached=plain))[:2]
+    told = {"rivals": sizes, "ties": ties_of(records)} if groups else {}
+    return Diagnosis("unknown_at", text + note, tuple(effects), tuple(groups), unknown=unknown, **(common | told))

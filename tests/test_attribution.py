@@ -14,6 +14,7 @@ from fitting.attribute import Trial, _physical, chi2_of, confidence, excess_of, 
 from fitting.diagnosis import Evidence
 from fitting.exchange import both_found
 from fitting.record_level import RecordEffect
+from fitting.report.banner import headline
 from fitting.report.diagnosis_page import _size
 from fitting.rows import behind, creeps_on, sizes_of, ties_of
 from fitting.screen import Candidate
@@ -151,6 +152,14 @@ def test_an_unknown_names_what_the_records_show_beside_the_loop(monkeypatch):
     beside = fitting.verdict.verdict(dataclasses.replace(evidence, adopted=((drift, []),)))
     assert [e["name"] for e in beside.effects] == ["zero_drift"] and beside.verdict == "unknown_at"
     assert beside.message.endswith("Found beside it, in what does not repeat with the drive: zero_drift.")
+    heat = dataclasses.replace(drift, name="thermal_drift")
+    either = fitting.verdict.verdict(dataclasses.replace(evidence, adopted=((drift, [heat]),)))
+    assert either.effects == () and either.groups == (["zero_drift", "thermal_drift"],) and set(either.rivals) == set(either.groups[0])
+    assert either.message.endswith("the drive: zero_drift or thermal_drift.")
+    for found, said in ((beside, "zero drift (sensor)"), (either, "zero drift or thermal drift")):
+        assert headline({"verdict": found.verdict, "unknown": found.unknown, "effects": found.effects, "groups": found.groups}).endswith(
+            f"; found beside it: {said}"
+        )
 
 
 def test_what_is_found_beside_an_effect_is_no_rival_of_it():

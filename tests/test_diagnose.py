@@ -126,11 +126,8 @@ def test_names_a_concealed_sensor_filter(bench):
     assert not set(found.absorbed) & {c.name for c in found.candidates if c.achieved_chi2_drop is not None}
 
 
-@pytest.mark.parametrize(
-    ("ends", "said", "named"),
-    [("at once", "unknown_at", []), ("after the leaders", "attributed", ["sensor_lag"])],
-)
 @pytest.mark.long
+@pytest.mark.parametrize(("ends", "said", "named"), [("at once", "unknown_at", []), ("after the leaders", "attributed", ["sensor_lag"])])
 def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, ends, said, named):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
     asked = {"sensor_lag", "transport_delay"}

@@ -64,7 +64,7 @@ def test_null_gradient_and_batch(kind):
     name, scale = f"effects.{kind.name}.{kind.amplitude}", kind.parameters()[kind.amplitude].scale
 
     value, step = 0.3 * scale, 1e-4 * scale
-    finite = kind.finite_trials([CURRENT[None]], [np.asarray([DT])], [CURRENT[None]])
+    finite = kind.finite_trials([CURRENT], [CURRENT], [DT])
     if finite:  # no derivative at null: where it acts
         extended = act.with_effect(kind(**finite[-1]))
         value = finite[-1][kind.amplitude]

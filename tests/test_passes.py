@@ -96,8 +96,7 @@ def along_some_directions(*held):
     return directions @ data_jacobian(problem, z).T, np.asarray(pushed(directions))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("beside", [(), (effects.MagneticAftereffect(share=0.02),)], ids=len)
+@pytest.mark.parametrize("beside", [(), pytest.param((effects.MagneticAftereffect(share=0.02),), marks=pytest.mark.long)], ids=len)
 def test_so_they_are_of_a_rod_in_shells(beside):
     found, expected = along_some_directions(effects.FieldDiffusion(kappa=0.7), *beside)
     largest = np.abs(expected).max(axis=1)
@@ -105,11 +104,8 @@ def test_so_they_are_of_a_rod_in_shells(beside):
     assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [pytest.param(e, marks=pytest.mark.long) for e in (effects.MagneticAftereffect(share=0.02), effects.SecondEddyPath(kappa=0.3))],
-    ids=lambda e: e.name,
-)
+@pytest.mark.long
+@pytest.mark.parametrize("effect", [effects.MagneticAftereffect(share=0.02), effects.SecondEddyPath(kappa=0.3)], ids=lambda e: e.name)
 def test_so_they_are_of_states_that_are_led_to_where_they_repeat(effect):
     """The end of a period reads what stood at the one before."""
     found, expected = along_some_directions(effect)

@@ -64,21 +64,26 @@ def _headline(found) -> str:
         return f"Found what the model leaves out: {names}"
     if verdict == "group":
         names = "; ".join(" or ".join(words(n) for n in g) for g in found["groups"])
-        beside = ", ".join(f"{words(e['name'])} ({e['block']})" for e in found["effects"])
-        found_beside = f"; found beside it: {beside}" if beside else ""
-        return f"Something is missing, and these recordings cannot say which: {names}{found_beside}"
+        return f"Something is missing, and these recordings cannot say which: {names}{_beside(found)}"
     if verdict == "nothing_missing" and (left := still_left(found)):
         return f"No effect {_asked(found)} was found{_judged(found)}; {left}"
     if verdict == "nothing_missing" and found.get("ended_after"):
         return f"No effect {_asked(found)} was found"
     if verdict == "unknown_at":
         where = found["unknown"]["block"] if found["unknown"] else "an unknown block"
-        return f"Something is missing that no effect {_asked(found)} explains; it acts most like the block {where}"
+        return f"Something is missing that no effect {_asked(found)} explains; it acts most like the block {where}{_beside(found, groups=True)}"
     return {
         "nothing_missing": "Nothing is missing: the model meets the recordings to their noise",
         "absorbed": "What may be missing cannot show in these recordings: the density absorbs it",
         "data_problem": f"{_at_fault(found)} must be mended first; no physics is judged",
     }.get(verdict, words(verdict))
+
+
+def _beside(found, groups: bool = False) -> str:
+    """The effects that were found beside what a headline is of, and, where asked for, the `groups`."""
+    names = [f"{words(e['name'])} ({e['block']})" for e in found["effects"]]
+    names += [" or ".join(map(words, g)) for g in found["groups"]] if groups else []
+    return f"; found beside it: {', '.join(names)}" if names else ""
 
 
 def _at_fault(found) -> str:

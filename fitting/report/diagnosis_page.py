@@ -325,7 +325,7 @@ def _left(found, base, repaired, sketch, output):
 def _shifts(found):
     after = (found["repaired"] or {}).get("parameters", {})
     shifts = {name: pair for e in found["effects"] for name, pair in e["shifts"].items()}
-    if not shifts and found["groups"] and found["base"]:  # those of the leading rival, which the repaired model holds
+    if not shifts and found["verdict"] == "group" and found["base"]:  # those of the leading rival, which the repaired model holds
         before = {n: p["value"] for n, p in found["base"]["parameters"].items() if p["free"] and not n.startswith("effects.")}
         shifts = {n: [value, after[n]["value"]] for n, value in before.items() if n in after}
     rows = []
@@ -338,7 +338,7 @@ def _shifts(found):
     if not rows:
         return None
     text = "To make up for what it lacked, the plain model had bent these constants; beside each, what it had got wrong."
-    if found["groups"]:
+    if found["verdict"] == "group":
         leading = " and ".join(words(g[0]) for g in found["groups"])
         text += f" So it is if the leading rival is right: {leading}."
     head = ["parameter", "before", "after", "unit", "was wrong by", "in standard errors"]

@@ -33,16 +33,8 @@ class AmplifierClipping(AbstractEffect):
     linkage: Float[Array, ""] = param(
         0.0, "A s/T", "turns times area over resistance", low=0.0, scale=5e-3, shape=True, detail=True, typical=(1e-3, 5e-2)
     )
-
     softness: Float[Array, ""] = param(
-        0.0,
-        "1",
-        "width over which the limit is round, of the limit (a hyperbola)",
-        low=0.0,
-        scale=0.05,
-        shape=True,
-        detail=True,
-        typical=(0.0, 0.3),
+        0.0, "1", "how round the limit is, as a hyperbola, of its voltage", low=0.0, scale=0.05, shape=True, detail=True, typical=(0.0, 0.3)
     )
 
     name = "amplifier_clipping"
@@ -58,7 +50,7 @@ class AmplifierClipping(AbstractEffect):
     in_step = True
 
     @classmethod
-    def finite_trials(cls, drives, steps, fluxes):
+    def finite_trials(cls, drives, fluxes, steps):
         """Limits at which to score it: parameters for shares of the largest voltage that the drives ask for, which the coil's own
         flux makes, or that of the rod, with a limit a little round: then it is the hysteresis that runs into it, and no share of dI/dt
         looks like that."""
@@ -67,7 +59,7 @@ class AmplifierClipping(AbstractEffect):
             peak = 0.0
             for drive, flux, dt in zip(drives, fluxes, steps, strict=True):
                 linked = tau * drive + linkage * flux
-                rate = (np.roll(linked, -1, axis=-1) - np.roll(linked, 1, axis=-1)) / (2 * np.asarray(dt)[:, None])
+                rate = (np.roll(linked, -1) - np.roll(linked, 1)) / (2 * dt)
                 peak = max(peak, float(np.max(np.abs(drive + rate))))
             behind = {"linkage": linkage, "softness": 0.02} if linkage else {}
             found += [{"tau_L": tau, **behind, "inverse_limit": 1 / (share * peak)} for share in (0.97, 0.9, 0.75)]
@@ -77,10 +69,10 @@ class AmplifierClipping(AbstractEffect):
         limit = 1 / jnp.maximum(self.inverse_limit, 1 / NO_LIMIT)
         a = self.tau_L / h
         middle, room = (a * before - self.linkage * flux_rate) / (1 + a), limit / (1 + a)
-        u, round_ = (command - middle) / room, self.softness > 0
-        width = jnp.where(round_, self.softness, 1.0) ** 2
+        u, is_round = (command - middle) / room, self.softness > 0
+        width = jnp.where(is_round, self.softness, 1.0) ** 2
         soft = middle + 0.5 * room * (jnp.sqrt((u + 1) ** 2 + width) - jnp.sqrt((u - 1) ** 2 + width))
-        return jnp.where(round_, soft, jnp.clip(command, middle - room, middle + room))
+        return jnp.where(is_round, soft, jnp.clip(command, middle - room, middle + room))
 
     def start(self, trial, actuator):
         """(current, field that it falls short of) at rest."""

@@ -111,10 +111,10 @@ class AbstractEffect(eqx.Module):
         return self.in_step or self.shells > 0 or self.block == "source"
 
     @classmethod
-    def finite_trials(cls, drives, steps, fluxes):
+    def finite_trials(cls, drives, fluxes, steps):
         """For an effect without a derivative at null: parameters at which the screening tries it, else None.
 
-        Per grid of samples: `drives`, A, and `fluxes`, the rod's flux density without it, T, (recordings, samples); `steps`: (recordings,), s.
+        A row each recording, of a period: `drives`, A, and `fluxes`, the rod's flux density without it, T, (samples,); `steps`, s.
         """
         return None
 

@@ -44,7 +44,7 @@ class FieldDiffusion(AbstractEffect):
     shells = 4
 
     @classmethod
-    def finite_trials(cls, drives, steps, fluxes):
+    def finite_trials(cls, drives, fluxes, steps):
         """The mean field and magnetization do not change to first order: scored where the skin leads, in either form of the strain."""
         return [{"kappa": 0.5}, {"kappa": 0.5, "alike": 1.0}]
 
