@@ -56,6 +56,7 @@ COARSE = 0.5  # of a misfit, that a finer density may leave where the first one 
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
+UNSEEN_TEXT = "Check recordings are missed, times their noise: {}; about as the fit expects, for they switch cells that no recording did."
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
 LATE_TEXT = "The limit of {:g} min (--minutes of magjax diagnose) left out what was still to be tried; with more time it may find more, or rivals to what it names."
@@ -131,7 +132,7 @@ def _with_missed_check(task, found, check) -> Diagnosis:
         return found
     ratios = [_surprise(r) for r in found.check]
     if not max(ratios, default=0.0) > MISSED:
-        return found
+        return _with_unseen_cells(found)
     worst = int(np.argmax(ratios))
     missed, left = check[worst], [c for k, c in enumerate(check) if k != worst]
     name = missed.origin.get("file", missed.name).rsplit("/", 1)[-1]
@@ -151,6 +152,14 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     row = {**found.check[worst], "rms_after": again.repaired.recordings[-1].residual_rms, "joined": True}
     again = dataclasses.replace(again, check=(*again.check[:worst], row, *again.check[worst:]))
     return again.noted(f"Without it among the recordings {told}; it joined them.")
+
+
+def _with_unseen_cells(found) -> Diagnosis:
+    """The diagnosis with a word on check recordings within the plane that are missed by far, as the fit expects."""
+    within = [r for r in found.check if r["noise_rms"] and r["beyond_plane"] <= BEYOND]
+    rows = [(r["file"].rsplit("/", 1)[-1], r["rms_after"] / r["noise_rms"]) for r in within]
+    far = [f"{name} by {ratio:.0f}" for name, ratio in rows if ratio > MISSED]
+    return found.noted(UNSEEN_TEXT.format(", ".join(far))) if far else found
 
 
 def _surprise(row) -> float:
@@ -289,8 +298,9 @@ def _wrong_name(task, evidence, found):
 
 def _absorbed(candidates, tried) -> tuple[str, ...]:
     """What these recordings could not show: the density makes nearly all of it, or bends to it beyond what its column tells. What
-    scores or was fitted did show."""
-    silent = [c for c in candidates if abs(c.z) < Z_THRESHOLD and c.name not in tried]
+    scores, or took its share in a fit, did show. `tried`: candidates that were fitted, by name."""
+    shown = {name for name, c in tried.items() if (c.achieved_chi2_drop or 0.0) > MIN_DROP}
+    silent = [c for c in candidates if abs(c.z) < Z_THRESHOLD and c.name not in shown]
     return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in (*LIKE_DENSITY, *FEEDBACKS))
 
 

@@ -59,6 +59,7 @@ FORM_ERROR = 0.005  # of what the effects found take: as little as that is left 
 WHOLE = 1.0, 0.9  # unless it ends at this chi2/N and takes that share of a misfit: another law seldom has just their form
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
+HIDES = 2.0  # chi2 per number of check recordings in units of what the fit expects to miss, from which a density may hide a feedback
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7; check recordings
 # that say for it count as much
 
@@ -127,9 +128,12 @@ def _forward(task, base, state, candidates, check, ends, free_means):
     any_rest, made_up = task.choices.rest == "auto", None
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
-        if not top or abs(top[0].z) < Z_THRESHOLD:
+        hidden = not top or abs(top[0].z) < Z_THRESHOLD
+        if hidden:
+            top = _hidden_feedbacks(state, candidates)
+        if not top:
             break
-        state.unsure = _calm(state) and abs(top[0].z) < SECOND_Z
+        state.unsure = hidden or (_calm(state) and abs(top[0].z) < SECOND_Z)
         if state.unsure and not state.foretell:
             break
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
@@ -176,6 +180,15 @@ def _best_of(trials):
 def _calm(state) -> bool:
     """Whether the effects found meet the noise."""
     return bool(state.steps) and state.current.chi2_per_sample < SILENT_CHI2
+
+
+def _hidden_feedbacks(state, candidates) -> list:
+    """Feedbacks that may be there though nothing scores: where the noise is met and check recordings are missed beyond what the fit
+    expects, its density may have bent to one; these must then speak for it."""
+    if not state.current.chi2_per_sample < SILENT_CHI2 or not state.foretell:
+        return []
+    told = state.foretell(state.current)
+    return [c for c in candidates if c.name in FEEDBACKS] if told is not None and told.whitened > HIDES else []
 
 
 def _takes_too_little(state, best, excess) -> bool:

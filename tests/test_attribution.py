@@ -170,6 +170,61 @@ def test_what_is_found_beside_an_effect_is_no_rival_of_it():
     assert names(first[1]) == ["amplifier_clipping", "second_mode"] and names(second[1]) == ["coulomb_friction"]
 
 
+def test_the_search_leaves_out_rivals_that_it_has_found(monkeypatch):
+    limit, friction = trial("amplifier_clipping", 26.0, base=121.0), trial("coulomb_friction", 0.9, base=26.0)
+
+    def forward(task, base, state, *given):
+        state.adopt(limit, [limit, trial("coulomb_friction", 26.0, base=121.0)])
+        state.adopt(friction, [friction])
+        return task, None, True
+
+    monkeypatch.setattr(fitting.search, "_forward", forward)
+    found = fitting.search.search(Task((), None), SimpleNamespace(choices=Choices()), [])
+    assert [names(rivals) for _, rivals, *_ in found.steps] == [["amplifier_clipping"], ["coulomb_friction"]]
+
+
+HIDDEN = [candidate("stress_feedback", 4.3), candidate("creep", 3.2, (0, 1, 0)), candidate("mean_field", -2.0, (0, 0, 1))]
+
+
+@pytest.mark.parametrize(
+    ("chi2n", "whitened", "says", "tried", "named"),
+    [
+        (1.04, 4.0, 54.0, ["stress_feedback"], ["stress_feedback"]),
+        (1.04, 4.0, 20.0, ["stress_feedback"], []),
+        (1.04, 1.3, 54.0, [], []),
+        (1.40, 4.0, 54.0, [], []),
+    ],
+    ids=["told by the checks", "too little", "as it expects", "the noise is not met"],
+)
+def test_a_feedback_that_the_density_hides_is_sought_where_checks_are_missed(monkeypatch, chi2n, whitened, says, tried, named):
+    """A stress_feedback of 8 %, absorbed to a score of 4.3, whose density missed the check recordings by twice their noise."""
+    base = trial("none", chi2n).result
+    asked = []
+
+    def fitted(task, current, top, *more):
+        asked.extend(names(top))
+        return [trial("stress_feedback", chi2n - 36 / COUNT, base=chi2n)]
+
+    def foretell(result):
+        return SimpleNamespace(whitened=whitened)
+
+    foretell.says_for = lambda after, before: says
+    monkeypatch.setattr(fitting.search, "Foreteller", lambda check, base: foretell)
+    monkeypatch.setattr(fitting.search, "_trials", fitted)
+    monkeypatch.setattr(fitting.search, "screened", lambda result, choices: [])
+    monkeypatch.setattr(fitting.search, "_finer", lambda task, now, best, good, *a: (best, good, task))
+    monkeypatch.setattr(fitting.search, "_once_more", lambda *a: None)
+    found = fitting.search.search(Task((), None), base, HIDDEN, ("check",))
+    assert asked[:1] == tried and [best.name for best, *_ in found.steps] == named
+
+
+def test_a_linear_strain_is_tried_beside_a_quartic_one_whatever_it_scores():
+    """A strain linear in part was called quartic: the density makes its first order."""
+    quartic, linear = candidate("quartic_magnetostriction", -5.8), candidate("linear_strain", 0.2, (0, 1, 0), visibility=1e-5)
+    assert names(family(quartic, [quartic, linear], {quartic.name})) == ["linear_strain"]
+    assert names(family(candidate("strain_hysteresis", 9.0), [linear], set())) == []
+
+
 def test_rivals_where_the_best_is_not_the_whole_truth():
     best, near, far = trial("second_mode", 2.0, base=300.0), trial("sensor_lag", 2.15, base=300.0), trial("creep", 2.5, base=300.0)
     assert names(rivals_of(best, [best, near, far])) == ["second_mode", "sensor_lag"]

@@ -153,6 +153,13 @@ def test_else_it_is_told(monkeypatch, again):
     assert not any("joined" in r for r in found.check)
 
 
+def test_a_check_that_is_missed_as_expected_is_told_and_joins_nothing(monkeypatch):
+    """A null whose recordings reached 0.557 A: one to 0.588 A was missed by 250 times its noise without a word."""
+    found, asked = with_missed(monkeypatch, missed(1, 250, 2, expected_rms=8e-6, verdict="nothing_missing"), None)
+    assert asked == [] and found.message.endswith("times their noise: c1.csv by 250; about as the fit expects, for they switch cells that no recording did.")
+    assert with_missed(monkeypatch, missed(1, 4, 2), None)[0].message == "So."
+
+
 @pytest.mark.parametrize(("minutes", "asks"), [(1e-9, 0), (np.inf, 1)], ids=["no time is left", "its search was ended"])
 def test_without_time_for_it_the_first_diagnosis_stands(monkeypatch, minutes, asks):
     """A group whose rivals a second search had no time to fit would come out as a name."""

@@ -12,7 +12,7 @@ import fitting.own_signals as signals_module
 import fitting.rough as rough_module
 import fitting.search as search_module
 import fitting.task as task_module
-from fitting.attribute import Trial, chi2_of, rivals_of
+from fitting.attribute import MIN_DROP, Trial, chi2_of, rivals_of
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
@@ -123,7 +123,7 @@ def test_names_a_concealed_sensor_filter(bench):
     named = next(c for c in found.candidates if c.name == "sensor_lag")  # the fall is that of its last fit
     assert named.achieved_chi2_drop == pytest.approx(chi2_of(found.base) - chi2_of(found.repaired))
     assert named.bic_change == pytest.approx(2 * np.log(found.base.data_count) - named.achieved_chi2_drop)
-    assert not set(found.absorbed) & {c.name for c in found.candidates if c.achieved_chi2_drop is not None}
+    assert not set(found.absorbed) & {c.name for c in found.candidates if (c.achieved_chi2_drop or 0.0) > MIN_DROP}
 
 
 @pytest.mark.long
@@ -568,7 +568,10 @@ def test_silent_on_random_cells(tmp_path, number):
 def test_what_scores_or_was_fitted_is_not_absorbed():
     candidates = [scored("quartic_magnetostriction", 22.8, 0.003), scored("linear_strain", 3.0, 0.003), scored("mean_field", 2.0)]
     candidates += [scored("accommodation", 4.0, 0.003), scored("creep", 1.0), scored("stress_feedback", 0.2)]
-    assert module._absorbed(candidates, {"accommodation": None}) == ("linear_strain", "mean_field", "stress_feedback")
+    took, not_taken = (dataclasses.replace(scored("accommodation", 4.0), achieved_chi2_drop=d) for d in (40.0, 2.0))
+    hidden = ("linear_strain", "mean_field", "stress_feedback")
+    assert module._absorbed(candidates, {"accommodation": took}) == hidden
+    assert set(module._absorbed(candidates, {"accommodation": not_taken})) == {"accommodation", *hidden}  # tried in vain
     assert "stress_feedback" not in module._absorbed([scored("stress_feedback", 9.0)], {})
 
 
