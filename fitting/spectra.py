@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 HARMONICS = 40
+ON_LINE = 0.6  # of the spacing that a record resolves, within which a tone stands on a line
 DRIFT_ZERO = 0.25  # of a drift's size: where it had begun is not known
 LOW_ORDERS = 10  # of a converter's integral nonlinearity
 LIKELIER = 4.0  # logarithm of a likelihood, by which another law of the noise must be the better
@@ -255,11 +256,30 @@ def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
     for tone, amplitude in spectrum.hum or ():
         # lines on the hum carry it with an unknown phase, lines beside it what its removal left: they count for less
         away = np.abs(np.arange(count) * spectrum.frequency - tone)
-        left = np.where(away < 0.6 * lowest, 1.0, 0.25 * np.minimum(1.0, lowest / (np.pi * np.maximum(away, lowest))))
+        left = np.where(away < ON_LINE * lowest, 1.0, 0.25 * np.minimum(1.0, lowest / (np.pi * np.maximum(away, lowest))))
         variance = variance + (left * amplitude) ** 2 / 4
     variance[0] += (DRIFT_ZERO * spectrum.drift) ** 2 + spectrum.zero**2
     variance = np.where(np.arange(count) == 0, variance, 0.5 * variance)
     return np.sqrt(variance if spectrum.systematic is None else variance + spectrum.systematic**2)
+
+
+def hum_on_lines(spectrum: Spectrum, count: int) -> np.ndarray:
+    """What hum of an unknown phase may add to lines 0 to `count` - 1 of the reading: the size of its coefficient, unit."""
+    lowest, found = spectrum.frequency / max(spectrum.periods, 1), np.zeros(count)
+    for tone, amplitude in spectrum.hum or ():
+        found[np.abs(np.arange(count) * spectrum.frequency - tone) < ON_LINE * lowest] += amplitude / 2
+    return found
+
+
+def without_hum(error, spectrum: Spectrum) -> np.ndarray:
+    """An error over the samples of a record, without as much of it as may be hum that stands on lines of the drive."""
+    sizes = hum_on_lines(spectrum, len(spectrum.reading))
+    phases = np.arange(len(error)) * spectrum.dt * spectrum.frequency
+    for order in np.flatnonzero(sizes):
+        turn = np.exp(2j * np.pi * order * phases)
+        line = np.mean(error * np.conj(turn))
+        error = error - 2 * (line * turn).real * min(1.0, sizes[order] / max(abs(line), 1e-300))
+    return error
 
 
 def gain_rows(spectra, deviations):

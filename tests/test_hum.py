@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.fit import fit
@@ -56,6 +57,27 @@ def test_hum_must_show_between_the_harmonics_where_it_can():
     assert not hum_is_seen(spectra_of(recorded(drives=(off, on)), BENCH), tones)
     assert hum_is_seen(spectra_of(recorded(HUM, (off, on)), BENCH), tones)
     assert hum_is_seen(spectra_of(recorded(drives=(on,)), BENCH), tones)  # it cannot show
+
+
+@pytest.mark.parametrize(("other", "left"), [(0.0, 0.0), (4.0, 3.0)], ids=["hum alone", "more than hum"])
+def test_hum_on_a_line_of_a_check_recording_is_no_error(other, left):
+    """A check recording of 10 Hz was missed by ten times its noise for a hum of 50 Hz, of which its own reading tells no phase."""
+    bench, truth = BENCH, concealed_actuator(BENCH)
+    row = record(truth, 10.0, 0.6, 0.1, np.random.default_rng(3), "10 Hz")
+    plain = check_errors(truth, truth, [row], bench)[0]["rms_after"]
+    wave = HUM * (1 + other) * np.sin(2 * np.pi * 50.0 * row.time + 1.1)
+    channels = {**row.channels, "displacement": row.channels["displacement"] + wave}
+    spoilt = dataclasses.replace(row, channels=channels)
+    known = dataclasses.replace(spoilt, origin={**row.origin, "hum": ((50.0, HUM * (1 + other - left)), (100.0, 0.0))})
+    as_is, less = (check_errors(truth, truth, [r], bench)[0]["rms_after"] for r in (spoilt, known))
+    assert as_is == pytest.approx(np.hypot(plain, HUM * (1 + other) / np.sqrt(2)), rel=0.05)
+    assert less == pytest.approx(np.hypot(plain, HUM * left / np.sqrt(2)), rel=0.05)
+
+
+def test_hum_on_a_line_is_no_residual_of_a_fit():
+    rows = [dataclasses.replace(r, origin={**r.origin, "hum": ((50.0, HUM), (100.0, 0.0))}) for r in recorded(HUM, DRIVES[:3])]
+    found = fit(rows, BENCH, refine=False)
+    assert all(r.residual_rms < 1.3 * r.noise_rms for r in found.recordings[::2])  # 10 and 50 Hz stand on it
 
 
 @pytest.mark.long
