@@ -11,6 +11,7 @@ from .attribute import UNCONFIRMED_TIE, chi2_of, confidence, tie_of
 CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
 DRIFTS = ("zero_drift", "thermal_drift")
 SLOW = ("creep", "magnetic_aftereffect")  # effects that go on for longer than a recording
+GOES_ON = {"creep": 1.0, "magnetic_aftereffect": 2.0}  # times its amplitude, as a share of the mean reading, that a drift of it is less than
 PARTIAL = 0.5  # most confidence in an effect of which not all rivals were fitted
 BEHIND = 5.0  # decades of a creep, that a mean may lack of its end
 
@@ -77,18 +78,22 @@ def ties_of(evidence) -> dict:
     return ties
 
 
-def creeps_on(effect, evidence) -> bool:
-    """Whether a drift within the records is a creep that was found, going on: all but a fifth of it to one side of the mean
-    displacement, away from where all came from, and less than a decade of it."""
+def creeps_on(effect, evidence) -> str | None:
+    """The slow effect that was found, where a drift within the records is that going on: all but a fifth of it to one side of the
+    mean displacement, away from where all came from, and less than a decade of a creep, or than all that is late of M makes of
+    its square; None elsewhere."""
     actuator = evidence.reached.current.actuator
-    found = "creep" in {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
-    if not found or effect.name not in DRIFTS or not effect.columns or effect.shapes.get("pulsation"):
-        return False
+    found = {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
+    slow = next((name for name in SLOW if name in found), None)
+    if slow is None or effect.name not in DRIFTS or not effect.columns or effect.shapes.get("pulsation"):
+        return None
     scale = 1.0 if effect.shapes.get("own") else effect.amplitude
     drifts = scale * np.asarray([column[-1] - column[0] for column in effect.columns])
     means = np.asarray([s.reading[0].real for s in evidence.raw.spectra])
     after = abs(np.sum(drifts * means)) > CREEPS_AFTER * np.sum(np.abs(drifts * means))
-    return bool(after and np.all(np.abs(drifts) < float(actuator.effect("creep").gain) * np.abs(means)))
+    late = actuator.effect(slow)
+    most = GOES_ON[slow] * float(getattr(late, late.amplitude))
+    return slow if after and np.all(np.abs(drifts) < most * np.abs(means)) else None
 
 
 def behind(effect, evidence) -> str | None:

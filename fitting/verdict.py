@@ -36,7 +36,7 @@ NEARER = (6.0, 0.3)  # or within this, and this share of the plain fit's
 SAYS_FOR = 10.0  # what these then say for a repair, as a fall of chi2, though their errors rise
 EXPECTED, AGAINST = 1.5, 0.1  # chi2 per number in these units, up to which a repair errs as it expects; share of its fall that they may speak against it
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
-CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the creep going on."
+CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the {} going on."
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
@@ -104,8 +104,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         if effect.shapes.get("zeros"):
             slow = behind(effect, evidence)
             form += BEHIND_TEXT.format(slow) if slow else ZEROS_TEXT.format(effect.amplitude)
-        elif creeps_on(effect, evidence) and CREEPS_TEXT not in form:
-            form += CREEPS_TEXT
+        elif (slow := creeps_on(effect, evidence)) and CREEPS_TEXT.format(slow) not in form:
+            form += CREEPS_TEXT.format(slow)
     form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
 
