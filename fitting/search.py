@@ -59,7 +59,8 @@ FORM_ERROR = 0.005  # of what the effects found take: as little as that is left 
 WHOLE = 1.0, 0.9  # unless it ends at this chi2/N and takes that share of a misfit: another law seldom has just their form
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
-HIDES = 2.0  # chi2 per number of check recordings in units of what the fit expects to miss, from which a density may hide a feedback
+HIDES = 2.0  # chi2 per number of check recordings in units of what the fit expects to miss, from which a density may hide a feedback,
+HIDDEN_DROP = 6.0  # and the fall of chi2 by that one; on nulls it was 4 at most
 SECOND_Z = 8.0  # a further effect where the noise is met already: what a rough density leaves scores 6 to 7; check recordings
 # that say for it count as much
 
@@ -70,8 +71,9 @@ class Reached:
 
     `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were;
     `foretell`: what fits say of the check recordings; `under_way`: trials by name of a round that has not come to its end;
-    `unsure`: whether check recordings must speak for what that round finds; `late`: whether the time was over before the search
-    was through; `partial`: whether what was reached stands on a round that did not come to its end.
+    `unsure`: the score that what that round finds must reach with what check recordings say for it, 0 where they need not;
+    `late`: whether the time was over before the search was through; `partial`: whether what was reached stands on a round that
+    did not come to its end.
     """
 
     current: object
@@ -80,7 +82,7 @@ class Reached:
     form: str | None = None
     foretell: Foreteller | None = None
     under_way: dict = dataclasses.field(default_factory=dict)
-    unsure: bool = False
+    unsure: float = 0.0
     late: bool = False
     partial: bool = False
 
@@ -133,7 +135,7 @@ def _forward(task, base, state, candidates, check, ends, free_means):
             top = _hidden_feedbacks(state, candidates)
         if not top:
             break
-        state.unsure = hidden or (_calm(state) and abs(top[0].z) < SECOND_Z)
+        state.unsure = Z_THRESHOLD if hidden else SECOND_Z if _calm(state) and abs(top[0].z) < SECOND_Z else 0.0
         if state.unsure and not state.foretell:
             break
         if len(state.steps) > 1 and state.current.chi2_per_sample > HOPELESS * FAR_FROM_NOISE:  # not by one more
@@ -144,7 +146,7 @@ def _forward(task, base, state, candidates, check, ends, free_means):
         trials = _trials(task, state.current, top, candidates, excess, state.under_way)
         state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
-        good, best = _best_of(trials)
+        good, best = _best_of(trials) if not hidden else _best_hidden(trials)
         if best is None:
             break
         if any(free_means(t.result, best.result) for t in good if t.name in SLOW):
@@ -177,6 +179,12 @@ def _best_of(trials):
     return good, min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5), default=None)
 
 
+def _best_hidden(trials):
+    """The same of effects that a density hides from the recordings: the check recordings must speak for them."""
+    good = [t for t in trials if t.physical and t.drop > HIDDEN_DROP]
+    return good, max(good, key=lambda t: t.drop, default=None)
+
+
 def _calm(state) -> bool:
     """Whether the effects found meet the noise."""
     return bool(state.steps) and state.current.chi2_per_sample < SILENT_CHI2
@@ -206,7 +214,7 @@ def _not_confirmed(state, best, excess, check) -> bool:
     further = state.steps and check and not _decides(state.current, best, excess)
     if further and _predicts_worse(state.current, best.result, state.foretell):
         return True
-    return state.unsure and best.drop + _confirmed(state.current, best.result, state.foretell) < SECOND_Z**2
+    return bool(state.unsure) and best.drop + _confirmed(state.current, best.result, state.foretell) < state.unsure**2
 
 
 def _adopt_of(state, base, check) -> bool:
