@@ -70,7 +70,6 @@ COMPANIONS = {**dict.fromkeys(("second_eddy_path", *LAGS), LAGS), "quartic_magne
 # the density bends to them further than its tangent tells, and a rough one scores as they do
 LIKE_DENSITY = ("mean_field", "reversible_magnetization", "accommodation")
 FEEDBACKS = ("stress_feedback",)  # its column says little where the base has bent to it: tried wherever it scores
-REAL_SIZE, REAL_BELOW = {"stress_feedback": 1e10}, 5.5  # a spring's, Pa/m, from which it begins, too, where it scores less than this
 # thresholds act at their size as they do not next to none: tried where they score and no effect takes most
 THRESHOLDS = ("backlash", "coulomb_friction")
 STRUCTURES = ("eddy_currents",)  # their column at null says little: at their real size they change which relays switch
@@ -124,8 +123,9 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
     actuator = base.actuator.with_effect(effect)
     if candidate.name in FEEDBACKS:  # the base's density has bent to do what it does: not from there
         result = task.fit(actuator, choices=base.choices, spectra=base.spectra, refine=False, target=target)
-        real = base.actuator.with_effect(effect.with_amplitude(REAL_SIZE[candidate.name]))
-        result = min(result, task.fit_on(base, real, target=target), key=finite_chi2) if candidate.z < REAL_BELOW else result
+        if base.chi2_per_sample < MISFIT:  # later nothing is left that asks for further starts
+            further = [task.fit_on(base, base.actuator.with_effect(e), target=target) for e in effect_class.elsewhere()]
+            result = min(result, *further, key=finite_chi2)
     else:
         result = task.fit_on(base, actuator, target=target)
         if not chi2_of(result) < chi2_of(base) and chi2_of(base) - candidate.z**2 < target:

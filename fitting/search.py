@@ -1,63 +1,41 @@
 """The search: leaders of the screening are fitted for real, the best is adopted while it earns its place, and screened again.
 
-Forward here; what is adopted once more, beside those that came later, in `exchange`.
+Forward here, round by round, with what lets an effect in; the fits of a round are in `trials`, what is settled before an effect is
+adopted in `adoption`, and what was adopted once more, beside those that came later, in `exchange`.
 """
 
 import dataclasses
 
 import numpy as np
 
+from .adoption import FAR_BESIDE, FORM_ERROR, of_two, promises, refitted
 from .attribute import (
     BIC_DROP,
-    CLOSE,
-    COMPANIONS,
     FEEDBACKS,
-    LIKE_DENSITY,
     MIN_DROP,
     MISFIT,
-    SETTLED_CHI2,
-    STRUCTURES,
-    THRESHOLDS,
-    TIE,
-    WEAK_TIE,
-    WORTH,
-    Trial,
     chi2_of,
-    credited,
     excess_of,
-    family,
-    finite_chi2,
-    in_detail,
     leaders,
-    of_one_family,
     rivals_of,
-    settled,
-    to_the_end,
-    try_effect,
 )
 from .check import check_errors
 from .diagnosis import SILENT_CHI2
 from .exchange import backward, both_found, commuted, exchange
-from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, finest, hats_of_step
+from .finer import finest
 from .foretold import Foreteller
-from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .rows import SLOW
 from .screen import screened
 from .task import Late
-from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
+from .together import let_go
+from .trials import try_all
+from .verdict import FAR_FROM_NOISE, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 BEYOND_PROMISE = 3.0  # times what it promises to first order, that an effect may take
-LITTLE_LEFT = 0.2  # share of a chi2/N that an effect may leave for a finer density to be tried beside it, however far that is
-FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
-LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
-IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise
-FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further,
-WHOLE = 1.0, 0.9  # unless it ends at this chi2/N and takes that share of a misfit: another law seldom has just their form
-NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
+WHOLE = 1.0, 0.9  # chi2/N and share of a misfit, at which what takes as little as FORM_ERROR is named: another law seldom has just their form
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 HIDES = 2.0  # chi2 per number of check recordings in units of what the fit expects to miss, from which a density may hide a feedback,
 HIDDEN_DROP = 6.0  # and the fall of chi2 by that one; on nulls it was 4 at most
@@ -143,10 +121,10 @@ def _forward(task, base, state, candidates, check, ends, free_means):
         excess = max(excess_of(state.current), MIN_DROP)
         if state.steps and _hopeless(state.current, top[0], excess):
             break
-        trials = _trials(task, state.current, top, candidates, excess, state.under_way)
+        trials = try_all(task, state.current, top, candidates, excess, state.under_way)
         state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
-        good, best = _best_of(trials) if not hidden else _best_hidden(trials)
+        good, best = _best_of(trials, hidden)
         if best is None:
             break
         if any(free_means(t.result, best.result) for t in good if t.name in SLOW):
@@ -162,9 +140,9 @@ def _forward(task, base, state, candidates, check, ends, free_means):
         left = screened(best.result, task.choices)
         if best.name not in SLOW and free_means(best.result, best.result, left):
             return task, made_up, True
-        if not state.steps and not _promises(base, best.result, left):
-            best, left = _of_two(task, best, left, good)
-        found, good, task = _finer(task, state.current, best, good, excess, any_rest, not _promises(base, best.result, left))
+        if not state.steps and not promises(base, best.result, left):
+            best, left = of_two(task, best, left, good)
+        found, good, task = refitted(task, state.current, best, good, excess, any_rest, not promises(base, best.result, left))
         candidates = left if found.result is best.result else screened(found.result, task.choices)
         state.adopt(found, good)
         let_go()
@@ -173,16 +151,12 @@ def _forward(task, base, state, candidates, check, ends, free_means):
     return task, made_up, False
 
 
-def _best_of(trials):
-    """The trials that take enough for their parameters and are physical, and the best of them, or None."""
-    good = [t for t in trials if t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
+def _best_of(trials, hidden: bool = False):
+    """The trials that take enough for their parameters and are physical, and the best of them, or None; of `hidden` ones, for
+    which check recordings must speak, any that take more than they do on nulls."""
+    least, worth = (HIDDEN_DROP, np.inf) if hidden else (MIN_DROP, -BIC_DROP)
+    good = [t for t in trials if t.physical and t.drop > least and t.bic_change < worth]
     return good, min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5), default=None)
-
-
-def _best_hidden(trials):
-    """The same of effects that a density hides from the recordings: the check recordings must speak for them."""
-    good = [t for t in trials if t.physical and t.drop > HIDDEN_DROP]
-    return good, max(good, key=lambda t: t.drop, default=None)
 
 
 def _calm(state) -> bool:
@@ -236,108 +210,6 @@ def _hopeless(current, leader, excess) -> bool:
     return finest(current.choices) and current.chi2_per_sample > MISFIT and BEYOND_PROMISE * leader.z**2 < LEAST_SHARE * excess
 
 
-def _trials(task, current, top, candidates, excess, under_way) -> list[Trial]:
-    """The leaders fitted beside the current fit, two side by side, until one meets the noise; then the family of the best.
-    `under_way`: a dict that is given each trial by name as soon as it has ended."""
-    trials = []
-
-    def useful(*others):
-        return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
-
-    def kept(trial):
-        under_way[trial.name] = trial
-        return trial
-
-    def begun(c, target):
-        return lambda say: kept(try_effect(task.on(progress=say), current, c, excess, target))
-
-    def ended(t, target):
-        return lambda say: kept(settled(task.on(progress=say), current, t, excess, target))
-
-    def attempt(these):
-        task.say(f"trying {' and '.join(c.name for c in these)}", current.chi2_per_sample)
-        first = together(
-            [begun(c, useful()) for c in these], task.progress, lambda k, results: _needless(these[k], results.values())
-        )
-        for c, t in zip(these, first, strict=True):
-            if t is None:  # needless, ended or not
-                under_way.pop(c.name, None)
-        first = [t for t in first if t is not None]
-        trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], task.progress))
-        let_go()
-
-    least = WORTH * abs(top[0].z)
-    while top:
-        attempt(top[:SIDE_BY_SIDE])
-        top = [c for c in top[SIDE_BY_SIDE:] if not _needless(c, trials)]
-    best = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
-    like = family(best.candidate, candidates, {t.name for t in trials}) if best else []
-    if best and best.explained_share < IMITATES and best.result.chi2_per_sample > FAR_FROM_NOISE:
-        # none takes most: a strong effect may act unlike its derivative at null
-        known = {t.name for t in trials} | {c.name for c in like}
-        others = [c for c in candidates if c.name not in known and c.visibility > 1e-3]
-        like += [c for c in others if abs(c.z) > (Z_THRESHOLD if c.name in THRESHOLDS else least)]
-    if best:
-        known = {t.name for t in trials} | {c.name for c in like}
-        like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]
-    for k in range(0, len(like), SIDE_BY_SIDE):
-        attempt(like[k : k + SIDE_BY_SIDE])
-    return _on_equal_terms(task, current, _led(task, current, trials, excess), excess)
-
-
-def _led(task, current, trials, excess) -> list[Trial]:
-    """The trials; where one meets the noise, its kin that ended in a misfit are fitted from where it ended, too: the density under
-    it is the right one, and that of the current fit, which has bent to what is missing, may hold them far off."""
-    ahead = min(trials, key=lambda t: finite_chi2(t.result), default=None)
-    if ahead is None or not ahead.result.chi2_per_sample < SETTLED_CHI2:
-        return trials
-    kin = COMPANIONS.get(ahead.name, ())
-    far = [t for t in trials if t.result.chi2_per_sample > MISFIT and t.name != ahead.name and (t.name in kin or of_one_family(t, ahead))]
-    if not far:
-        return trials
-    target = chi2_of(ahead.result) + 2 * WEAK_TIE[1]
-    base = ahead.result.actuator.without_effect(ahead.name)
-
-    def from_there(t):
-        effect = t.result.actuator.effect(t.name)
-
-        def one(say):
-            result = task.on(progress=say).fit_on(ahead.result, base.with_effect(effect), choices=ahead.result.choices, target=target)
-            return credited(t.candidate, result, current, effect, excess)
-
-        return one
-
-    better = {t.name: t for t in together([from_there(t) for t in far], task.progress)}
-    return [min(t, better.get(t.name, t), key=lambda x: finite_chi2(x.result)) for t in trials]
-
-
-def _on_equal_terms(task, current, trials, excess) -> list[Trial]:
-    """The trials; of those that meet the noise and come near the best, each with the details of its law.
-
-    Where the noise is met nobody asks for details, and a law with more shapes wins by the form of the right one's.
-    """
-    good = [t for t in trials if t.physical and t.drop > MIN_DROP]
-    best = min(good, key=lambda t: t.bic_change, default=None)
-    if best is None or best.result.chi2_per_sample > MISFIT:
-        return trials
-    near = best.bic_change + max(2 * TIE, NEAR_IN_DETAIL * best.drop)
-    near = [t for t in good if t.bic_change < near and t.result.chi2_per_sample < MISFIT]
-    if len(near) < 2:
-        return trials
-
-    def detailed(t):
-        return lambda say: in_detail(task.on(progress=say), current, t, excess)
-
-    found = dict(zip(map(id, near), together([detailed(t) for t in near], task.progress), strict=True))
-    return [found.get(id(t), t) for t in trials]
-
-
-def _needless(candidate, trials) -> bool:
-    """Whether a leader that meets the noise leaves only close rivals to try, and this is none."""
-    met = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
-    return candidate.name not in STRUCTURES and any(abs(candidate.z) < CLOSE * abs(t.candidate.z) for t in met)
-
-
 def _whole(current, best) -> bool:
     """Whether an effect takes all that those before it leave, a clear misfit, down to the noise."""
     return current.chi2_per_sample > MISFIT and best.result.chi2_per_sample < WHOLE[0] and best.explained_share > WHOLE[1]
@@ -364,90 +236,3 @@ def _confirmed(before, after, foretell) -> float:
     """What the check recordings say for a further effect, as a fall of chi2; without end against it where that is next to nothing."""
     says = foretell.says_for(after, before)
     return says if says is not None and says > BIC_DROP else -np.inf
-
-
-def _promises(base, result, candidates) -> bool:
-    """Whether a further effect promises more than half of a misfit, and more than the form of those found leaves: then the
-    density waits, for a finer one would take it up. It does not wait for what a rough one passes for."""
-    least = max(HALF * excess_of(result), FORM_ERROR * (chi2_of(base) - chi2_of(result)))
-    promised = max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)
-    return result.chi2_per_sample > FAR_BESIDE and promised > least
-
-
-def _of_two(task, best, left, good):
-    """The best and the scores beside it; or a rival's, with which a further effect explains what the best leaves.
-
-    One effect with shapes of its own imitates two others better than either of them alone; and where none takes most, the
-    first to be found is seldom one of the two. Rivals of other directions are looked ahead from by their scores.
-    """
-    if best.result.chi2_per_sample < MISFIT:
-        return best, left
-    tried, ahead = [best], []
-    near = MISFIT if best.explained_share > IMITATES else FAR_FROM_NOISE
-    for rival in sorted((t for t in good if t is not best), key=lambda t: chi2_of(t.result)):
-        if chi2_of(rival.result) > LEADS_WITHIN * chi2_of(best.result) or len(tried) > RIVALS_OF_TWO:
-            break
-        if any(abs(chi2_of(t.result) / chi2_of(rival.result) - 1) < SAME or of_one_family(t, rival) for t in tried):
-            continue
-        tried.append(rival)
-        scores = screened(rival.result, task.choices)
-        first, excess = scores[0], excess_of(rival.result)
-        promised = chi2_of(rival.result) - first.z**2
-        if first.z**2 > HALF * excess and promised < chi2_of(best.result) - MIN_DROP:
-            ahead.append((promised, rival, scores))
-    for _, rival, scores in sorted(ahead, key=lambda row: row[0]):
-        pair = to_the_end(task, rival.result, scores[0], excess_of(rival.result))
-        cost = (rival.parameters + pair.parameters - best.parameters) * np.log(pair.result.data_count)
-        met = pair.physical and pair.result.chi2_per_sample < near
-        if met and chi2_of(pair.result) + cost < chi2_of(best.result) - max(BIC_DROP, HALF * excess_of(best.result)):
-            return rival, scores
-    return best, left
-
-
-def _finer(task, current, best, good, excess, any_rest: bool = True, any_density: bool = True):
-    """The best with another start memory and with a finer density where it still leaves something: both were chosen under
-    the misfit of the base. Where it leaves much of which nothing further promises half, only the finest hats, which must take half
-    of it. Where that changes them, the near rivals are tried again on the same. Returns the best, the trials beside it, and the
-    task with what was chosen.
-
-    Start memories that serve as well foretell other mean levels: the one that is tried first stands unless another is
-    better by MIN_DROP.
-    """
-    found = chosen = task.choices
-    free = dataclasses.replace(chosen, rest="auto")
-    order = sum(rests_of(task.bench, free), ())
-    any_rest = any_rest and len(order) > 1
-    if any_rest and (chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED and not memory_is_told(best.result)):
-        other = task.fit_on(best.result, best.result.actuator, choices=free)
-        margin = MIN_DROP if order.index(other.choices.rest) < order.index(chosen.rest) else -MIN_DROP
-        against = against_memory([(fit.problem, fit.solution) for fit in (other, best.result)])
-        if against[0] < against[1] + margin:
-            found = other.choices
-    ahead, left, highest = best.result, best.result.chi2_per_sample, max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
-    if any_density and finer_hats(chosen) and FINER_FROM[0] < left < highest:
-        found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra, refine=highest).choices
-    elif any_density and left >= highest:
-        for choices in hats_of_step(found, task.bench, 2):
-            last = task.fit_on(best.result, best.result.actuator, choices=choices)
-            if excess_of(last) < HALF * excess_of(best.result):
-                found, ahead = choices, last
-    if found == chosen:
-        return best, good, task
-    before, task = task, task.on(choices=found)
-    near = [t for t in good if chi2_of(t.result) < chi2_of(best.result) + max(20 * TIE, 0.2 * chi2_of(best.result))]
-
-    def anew(t):
-        def one(say):
-            told = task.on(progress=say)
-            start = ahead if t is best else t.result
-            result = told.fit_on(start, start.actuator)  # from the plain fit's density, of another memory, it may end far off
-            return settled(told, current, credited(t.candidate, result, current, result.actuator.effect(t.name), excess), excess)
-
-        return one
-
-    again = [t for t in together([anew(t) for t in near], task.progress) if t.physical]
-    ended = min(again, key=lambda t: t.bic_change, default=best)
-    if not again or chi2_of(ended.result) > chi2_of(best.result) + MIN_DROP:
-        return best, good, before
-    far = [t for t in good if t.name not in {a.name for a in again}]  # no rivals alone, but they may be beside a later effect
-    return ended, [*again, *far], task

@@ -6,9 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import fitting.adoption
 import fitting.attribute
 import fitting.exchange
 import fitting.search
+import fitting.trials
 import fitting.verdict
 from fitting.attribute import Trial, _physical, chi2_of, confidence, excess_of, family, leaders, rivals_of, tie_of
 from fitting.diagnosis import Evidence
@@ -212,12 +214,33 @@ def test_a_feedback_that_the_density_hides_is_sought_where_checks_are_missed(mon
 
     foretell.says_for = lambda after, before: says
     monkeypatch.setattr(fitting.search, "Foreteller", lambda check, base: foretell)
-    monkeypatch.setattr(fitting.search, "_trials", fitted)
+    monkeypatch.setattr(fitting.search, "try_all", fitted)
     monkeypatch.setattr(fitting.search, "screened", lambda result, choices: [])
-    monkeypatch.setattr(fitting.search, "_finer", lambda task, now, best, good, *a: (best, good, task))
+    monkeypatch.setattr(fitting.search, "refitted", lambda task, now, best, good, *a: (best, good, task))
     monkeypatch.setattr(fitting.search, "_once_more", lambda *a: None)
     found = fitting.search.search(Task((), None), base, HIDDEN, ("check",))
     assert asked[:1] == tried and [best.name for best, *_ in found.steps] == named
+
+
+@pytest.mark.parametrize(("left", "starts", "ends"), [(1.0, [1e10], 0.98), (2.0, [], 0.99)], ids=["meets the noise", "a misfit"])
+def test_a_feedback_beside_the_noise_is_begun_from_a_springs_size_too(left, starts, ends):
+    """From its first order one of 8 % took 3 in chi2, from 1e10 Pa/m 8; where a misfit is left `settled` asks for further starts."""
+    rod, begun = load_bench("aa-050h").actuator(), []
+
+    def ended(chi2n, actuator):
+        return SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=actuator, converged=True)
+
+    class Fits:
+        def fit(self, actuator, **how):
+            return ended(0.99, actuator)
+
+        def fit_on(self, start, actuator, target):
+            begun.append(float(actuator.effect("stress_feedback").stiffness))
+            return ended(0.98, actuator)
+
+    base = SimpleNamespace(chi2_per_sample=left, data_count=COUNT, actuator=rod, choices=Choices(), spectra=())
+    found = fitting.attribute.try_effect(Fits(), base, candidate("stress_feedback", 2.3), 25.0)
+    assert begun == starts and found.result.chi2_per_sample == ends
 
 
 def test_a_linear_strain_is_tried_beside_a_quartic_one_whatever_it_scores():
@@ -264,7 +287,7 @@ def test_what_takes_less_than_half_of_the_rest_is_not_named(base, after, named):
     ids=["as good", "worse", "hardly better", "better", "better, and its levels are off"],
 )  # fmt: skip
 def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, held, found, chi2n, strain, taken):
-    import fitting.search as module
+    import fitting.adoption as module
     from magjax.bench import load_bench
 
     best = trial("sensor_lag", 1.0)
@@ -292,18 +315,18 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     task = Task((), load_bench("aa-050h"), Choices(rest=held))
     assert task.bench.start == "auto"
     far = trial("creep", 2.0)
-    _, kept, asked = module._finer(task, before, best, [best, far], 1.0)
+    _, kept, asked = module.refitted(task, before, best, [best, far], 1.0)
     assert asked.choices.rest == (found if taken else held) and again == ([found] if taken else [])
     assert names(kept) == ["sensor_lag", "creep"]  # it may serve beside a later effect
-    *_, fixed = module._finer(task, before, best, [best], 1.0, any_rest=False)
+    *_, fixed = module.refitted(task, before, best, [best], 1.0, any_rest=False)
     assert fixed.choices.rest == held
     for level, free in ((0.4, False), (0.6, True)):  # calm levels tell the first, where a misfit is left: no other is asked for
         vars(best.result).update(ended(2.0, level), chi2_per_sample=2.0)
-        *_, first = module._finer(task.on(choices=Choices(rest="negative")), before, best, [best], 1.0, any_density=False)
+        *_, first = module.refitted(task.on(choices=Choices(rest="negative")), before, best, [best], 1.0, any_density=False)
         assert first.choices.rest == (found if free else "negative")
     vars(best.result).update(ended(1.0, 0.6), chi2_per_sample=1.0)
     spoiled.append(True)  # what ends far off from there is not taken
-    kept, _, back = module._finer(task, before, best, [best], 1.0)
+    kept, _, back = module.refitted(task, before, best, [best], 1.0)
     assert kept is best and back.choices.rest == held
 
 
@@ -320,7 +343,7 @@ def test_a_finer_density_is_tried_beside_what_takes_nearly_all(monkeypatch, befo
     found = SimpleNamespace(choices=Choices(rest="negative"))
     monkeypatch.setattr("fitting.task.Task.fit", lambda *a, refine, **k: limits.append(refine) or found)
     task = Task((), SimpleNamespace(start="negative"), Choices(rest="negative"))
-    fitting.search._finer(task, SimpleNamespace(chi2_per_sample=before), best, [best], 1.0, any_rest=False)
+    fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=before), best, [best], 1.0, any_rest=False)
     assert limits == [pytest.approx(asked)]
 
 
@@ -336,10 +359,10 @@ def test_the_finest_hats_are_tried_beside_what_leaves_much_that_nothing_promises
         return finest
 
     monkeypatch.setattr("fitting.task.fit_or_stop", fit)
-    monkeypatch.setattr(fitting.search, "credited", lambda c, result, *a: dataclasses.replace(best, result=result))
+    monkeypatch.setattr(fitting.adoption, "credited", lambda c, result, *a: dataclasses.replace(best, result=result))
     task = Task((), SimpleNamespace(start="negative", drive="current"), Choices(rest="negative"))
     before = SimpleNamespace(chi2_per_sample=92.2)
-    found, _, then = fitting.search._finer(task, before, best, [best], 1.0, any_rest=False, any_density=not promised)
+    found, _, then = fitting.adoption.refitted(task, before, best, [best], 1.0, any_rest=False, any_density=not promised)
     assert asked == ([] if promised else [(48, 32)] * (2 if taken else 1))  # near rivals are fitted on them, too: here the best itself
     assert (then.choices.knots == (48, 32), found.result is finest) == (taken, taken)
 
@@ -594,16 +617,16 @@ def test_an_unknown_offers_no_repair_that_foretells_worse(monkeypatch, after, of
 
 
 def searched(monkeypatch, ends, follows):
-    """`search._of_two` with trials that end at chi2/N `ends`; `follows`: after each the best score, and where a fit of it ends."""
+    """`adoption.of_two` with trials that end at chi2/N `ends`; `follows`: after each the best score, and where a fit of it ends."""
     trials = [trial(n, x, base=110.0, direction=d) for n, x, d in ends]
     scores = {id(t.result): [candidate(follows[t.name][0], follows[t.name][1])] for t in trials}
-    monkeypatch.setattr(fitting.search, "screened", lambda result, choices: scores[id(result)])
+    monkeypatch.setattr(fitting.adoption, "screened", lambda result, choices: scores[id(result)])
     monkeypatch.setattr(
-        fitting.search, "to_the_end",
+        fitting.adoption, "to_the_end",
         lambda task, result, c, excess: next(trial(c.name, follows[t.name][2], 2) for t in trials if t.result is result),
     )  # fmt: skip
     best = trials[0]
-    return fitting.search._of_two(Task((), None), best, scores[id(best.result)], trials)[0].name
+    return fitting.adoption.of_two(Task((), None), best, scores[id(best.result)], trials)[0].name
 
 
 def test_where_no_effect_takes_most_it_is_looked_ahead_from_each(monkeypatch):
@@ -639,16 +662,16 @@ def test_a_further_effect_that_promises_next_to_nothing_is_not_tried_on_the_fine
 def test_what_the_form_of_a_law_leaves_promises_nothing():
     """A hundredth of a per cent of what was found is left by the law's form, however it scores."""
     base, after = (trial("excess_loss", x).result for x in (150.0, 2.1))
-    assert not fitting.search._promises(base, after, [candidate("rate_dependent_switching", 20.0)])
-    assert fitting.search._promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 26.0)])
-    assert not fitting.search._promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 15.0)])
+    assert not fitting.adoption.promises(base, after, [candidate("rate_dependent_switching", 20.0)])
+    assert fitting.adoption.promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 26.0)])
+    assert not fitting.adoption.promises(trial("excess_loss", 9.0).result, after, [candidate("creep", 15.0)])
 
 
 def test_a_finer_density_does_not_wait_for_what_a_rough_one_passes_for():
     base, after = (trial("quartic_magnetostriction", x).result for x in (92.0, 48.0))
     scores = candidate("mean_field", 200.0), candidate("creep", 15.0)
-    assert not fitting.search._promises(base, after, scores)
-    assert fitting.search._promises(base, after, [*scores, candidate("second_mode", 190.0)])
+    assert not fitting.adoption.promises(base, after, scores)
+    assert fitting.adoption.promises(base, after, [*scores, candidate("second_mode", 190.0)])
 
 
 @pytest.mark.parametrize(
@@ -666,9 +689,9 @@ def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypat
         name = "excess_loss" if current is base else "rate_dependent_switching"
         return [trial(name, ends[name], base=current.chi2_per_sample)]
 
-    monkeypatch.setattr(fitting.search, "_trials", fitted)
+    monkeypatch.setattr(fitting.search, "try_all", fitted)
     monkeypatch.setattr(fitting.search, "screened", lambda result, choices: [candidate("rate_dependent_switching", 20.0)])
-    monkeypatch.setattr(fitting.search, "_finer", lambda task, now, best, good, *a: (best, good, task))
+    monkeypatch.setattr(fitting.search, "refitted", lambda task, now, best, good, *a: (best, good, task))
     monkeypatch.setattr(fitting.search, "_predicts_worse", lambda *a: worse)
     base.choices, base.actuator = Choices(), SimpleNamespace(effects=())
     for part in ("backward", "exchange", "commuted"):
@@ -814,11 +837,11 @@ def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, leader
     ends = {"second_mode": leader, "backlash": 2.0, "creep": 50.0}
     rows = [candidate("second_mode", 600.0), candidate("backlash", z, (0, 1, 0)), candidate("creep", 100.0, (0, 0, 1))]
     fitted = lambda task, current, c, excess, target: dataclasses.replace(trial(c.name, ends[c.name], base=100.0), candidate=c)
-    monkeypatch.setattr(fitting.search, "try_effect", fitted)
-    monkeypatch.setattr(fitting.search, "settled", lambda task, current, t, excess, target: t)
+    monkeypatch.setattr(fitting.trials, "try_effect", fitted)
+    monkeypatch.setattr(fitting.trials, "settled", lambda task, current, t, excess, target: t)
     task = Task((), None, progress=lambda *a: None)
     current = SimpleNamespace(chi2_per_sample=100.0, data_count=COUNT)
-    assert names(fitting.search._trials(task, current, rows[:1], rows, 99.0 * COUNT, {})) == tried
+    assert names(fitting.trials.try_all(task, current, rows[:1], rows, 99.0 * COUNT, {})) == tried
 
 
 @pytest.mark.parametrize(("z", "tried"), [(9.7, True), (4.0, False)])
@@ -827,11 +850,11 @@ def test_a_feedback_that_scores_is_tried_though_another_meets_the_noise(monkeypa
     ends = {"quartic_magnetostriction": 1.03, "stress_feedback": 0.97}
     rows = [candidate("quartic_magnetostriction", 14.6), candidate("stress_feedback", z, (0, 1, 0))]
     fitted = lambda task, current, c, excess, target: dataclasses.replace(trial(c.name, ends[c.name], base=1.3), candidate=c)
-    monkeypatch.setattr(fitting.search, "try_effect", fitted)
-    monkeypatch.setattr(fitting.search, "settled", lambda task, current, t, excess, target: t)
-    monkeypatch.setattr(fitting.search, "in_detail", lambda task, base, t, excess: t)
+    monkeypatch.setattr(fitting.trials, "try_effect", fitted)
+    monkeypatch.setattr(fitting.trials, "settled", lambda task, current, t, excess, target: t)
+    monkeypatch.setattr(fitting.trials, "in_detail", lambda task, base, t, excess: t)
     current = SimpleNamespace(chi2_per_sample=1.3, data_count=COUNT)
-    found = fitting.search._trials(Task((), None, progress=lambda *a: None), current, leaders(rows), rows, 0.38 * COUNT, {})
+    found = fitting.trials.try_all(Task((), None, progress=lambda *a: None), current, leaders(rows), rows, 0.38 * COUNT, {})
     assert ("stress_feedback" in names(found)) is tried
 
 
@@ -959,16 +982,16 @@ def test_rivals_that_meet_the_noise_are_compared_with_the_details_of_their_laws(
         asked.append(t.name)
         return trial("magnetic_aftereffect", 0.98, parameters=3) if t.name == "magnetic_aftereffect" else t
 
-    monkeypatch.setattr(fitting.search, "in_detail", detailed)
+    monkeypatch.setattr(fitting.trials, "in_detail", detailed)
     trials = [
         trial("structural_damping", 1.04, 3), trial("magnetic_aftereffect", 1.09, 2), trial("creep", 1.6), trial("backlash", 1.07, physical=False)
     ]  # fmt: skip
-    found = fitting.search._on_equal_terms(Task((), None), None, trials, 1000.0)
+    found = fitting.trials._on_equal_terms(Task((), None), None, trials, 1000.0)
     assert sorted(asked) == ["magnetic_aftereffect", "structural_damping"] and names(found) == names(trials)
     assert found[1].result.chi2_per_sample == 0.98 and found[0] is trials[0]
     asked.clear()  # nothing to compare with, or the best does not meet the noise: settled by itself
-    assert fitting.search._on_equal_terms(Task((), None), None, trials[:1], 1000.0) == trials[:1]
-    assert fitting.search._on_equal_terms(Task((), None), None, trials[2:3], 1000.0) == trials[2:3] and not asked
+    assert fitting.trials._on_equal_terms(Task((), None), None, trials[:1], 1000.0) == trials[:1]
+    assert fitting.trials._on_equal_terms(Task((), None), None, trials[2:3], 1000.0) == trials[2:3] and not asked
 
 
 def test_kin_of_what_meets_the_noise_are_fitted_from_where_it_ended(monkeypatch):
@@ -992,10 +1015,10 @@ def test_kin_of_what_meets_the_noise_are_fitted_from_where_it_ended(monkeypatch)
         return found
 
     monkeypatch.setattr(Task, "fit_on", fit_on)
-    found = fitting.search._led(Task((), None), trial("creep", 3.0).result, trials, 1000.0)
+    found = fitting.trials._led(Task((), None), trial("creep", 3.0).result, trials, 1000.0)
     assert sorted(asked) == [("amplifier_lag", True), ("backlash", True)]
     assert [t.result.chi2_per_sample for t in found] == [0.97, 0.96, 1.2, 20.0, 20.0]
-    assert fitting.search._led(Task((), None), None, trials[1:2], 1000.0) == trials[1:2] and len(asked) == 2
+    assert fitting.trials._led(Task((), None), None, trials[1:2], 1000.0) == trials[1:2] and len(asked) == 2
 
 
 @pytest.mark.parametrize(

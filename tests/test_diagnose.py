@@ -12,6 +12,7 @@ import fitting.own_signals as signals_module
 import fitting.rough as rough_module
 import fitting.search as search_module
 import fitting.task as task_module
+import fitting.trials as trials_module
 from fitting.attribute import MIN_DROP, Trial, chi2_of, rivals_of
 from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
@@ -133,14 +134,15 @@ def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, 
     asked = {"sensor_lag", "transport_delay"}
     choices = Choices(without=tuple(e.name for e in CATALOGUE if e.name not in asked))
     part = "leaders" if ends == "at once" else "family"  # too late for any effect, or for rivals alone
-    now, made = [0.0], getattr(search_module, part)
+    place = search_module if ends == "at once" else trials_module
+    now, made = [0.0], getattr(place, part)
 
     def over(*arguments):
         now[0] = 151.0
         return made(*arguments)
 
     monkeypatch.setattr(task_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr(search_module, part, over)
+    monkeypatch.setattr(place, part, over)
     found = diagnose(runs, bench, check=checks, choices=choices, minutes=2.5)
     assert found.verdict == said and [e["name"] for e in found.effects] == named
     assert "limit of 2.5 min" in found.message and found.as_dict()["ended_after"] == 2.5
@@ -163,7 +165,7 @@ def test_of_a_round_that_was_ended_the_best_trial_is_kept_where_a_full_round_wou
         under_way["backlash"] = trial("backlash", second, taken)
         raise Late
 
-    alone(monkeypatch, _trials=trials)
+    alone(monkeypatch, try_all=trials)
     reached = search_module.search(Task((), None), plain, [scored("creep", 40.0)])
     assert reached.late and [best.name for best, *_ in reached.steps] == adopted and set(reached.tried) == {"creep", "backlash"}
     assert reached.current is (second if len(adopted) > 1 else first) and reached.partial == (len(adopted) > 1)
@@ -173,7 +175,7 @@ def alone(monkeypatch, **made):
     """The rounds of a search by themselves, with what is `made` in place of its parts."""
     usual = {
         "leaders": lambda candidates: candidates, "screened": lambda *a: [scored("backlash", 20.0)], "_predicts_worse": lambda *a: False,
-        "_finer": lambda task, now, best, good, *a: (best, good, task), "_of_two": lambda task, best, left, good: (best, left),
+        "refitted": lambda task, now, best, good, *a: (best, good, task), "of_two": lambda task, best, left, good: (best, left),
     }  # fmt: skip
     for name, function in {**usual, **made}.items():
         monkeypatch.setattr(search_module, name, function)
@@ -186,7 +188,7 @@ def test_what_a_round_has_refused_is_not_adopted_when_the_time_is_over_later(mon
     def late(*_):
         raise Late
 
-    alone(monkeypatch, _trials=lambda *a: next(rounds), backward=late)
+    alone(monkeypatch, try_all=lambda *a: next(rounds), backward=late)
     reached = search_module.search(Task((), None), plain, [scored("creep", 40.0)], check=("one",))
     assert reached.late and [best.name for best, *_ in reached.steps] == ["creep"] and reached.form == "backlash"
     assert reached.current is form and not reached.partial
@@ -278,8 +280,8 @@ def test_a_later_round_does_not_overwrite_what_was_tried_beside_the_plain_fit(mo
     fits = [a_fit(15.0, 58.0), a_fit(4.0, 60.0, "creep"), a_fit(3.0, 62.0, "creep", "backlash")]
     rounds = iter([[trial("creep", fits[1], 1100.0), trial("backlash", fits[1], 900.0)], [trial("backlash", fits[2], 100.0)], []])
     for name, made in {
-        "leaders": lambda candidates: candidates, "_trials": lambda *a: next(rounds), "screened": lambda *a: [scored("backlash", 20.0)],
-        "_finer": lambda task, now, best, good, *a: (best, good, task), "backward": lambda *a: None, "exchange": lambda *a: None,
+        "leaders": lambda candidates: candidates, "try_all": lambda *a: next(rounds), "screened": lambda *a: [scored("backlash", 20.0)],
+        "refitted": lambda task, now, best, good, *a: (best, good, task), "backward": lambda *a: None, "exchange": lambda *a: None,
     }.items():  # fmt: skip
         monkeypatch.setattr(search_module, name, made)
     reached = search_module.search(Task((), None), fits[0], [scored("creep", 40.0)])

@@ -60,8 +60,8 @@ def test_silent_and_resumed(final, runs, tmp_path):
 def test_an_alarm_of_the_screening_is_fitted_and_names_nothing(final, runs, monkeypatch):
     monkeypatch.setattr(search_module, "Z_THRESHOLD", 1e-3)
     tried = []
-    trials = search_module._trials
-    monkeypatch.setattr(search_module, "_trials", lambda *a: tried.append(a) or trials(*a))
+    trials = search_module.try_all
+    monkeypatch.setattr(search_module, "try_all", lambda *a: tried.append(a) or trials(*a))
     monkeypatch.setattr("fitting.placebo.Z_THRESHOLD", 1e-3)
     monkeypatch.setattr(search_module, "leaders", lambda candidates: candidates[:1])
     found = placebo(final, runs, 1)
