@@ -7,7 +7,7 @@ from magjax.plausibility import si_unit
 from magjax.simulate import simulate
 
 from .model import Predictor, predicted_lines
-from .spectra import evaluate_lines, reduce_recording, without_hum
+from .spectra import evaluate_lines, hum_part, reduce_recording
 
 SAMPLES, HARMONICS, PERIODS = 500, 40, 4  # of a prediction: points a period, lines, periods simulated
 WIDE = 160  # lines of one of a drive of many lines, such as a multisine, whose reading has more than HARMONICS
@@ -50,8 +50,8 @@ def predictions(actuator, recordings, bench) -> list:
     spectra = [all_lines(recordings[k], bench) for k in periodic]
     for k, s, lines in zip(periodic, spectra, predicted_periods(actuator, spectra), strict=True):
         phases = np.arange(s.samples) * s.dt * s.frequency
-        predicted, measured = evaluate_lines(lines, phases), np.asarray(recordings[k].channels[bench.output][: s.samples], float)
-        found[k] = predicted, predicted + without_hum(measured - predicted, s) if s.hum else measured, s.noise_rms
+        hum = evaluate_lines(hum_part(s.reading - lines[: len(s.reading)], s), phases)
+        found[k] = evaluate_lines(lines, phases), recordings[k].channels[bench.output][: s.samples] - hum, s.noise_rms
     rows = [(recordings[k], *found[k]) for k in range(len(recordings))]
     return [(predicted, _levelled(np.asarray(y, float), predicted, r, bench), noise) for r, predicted, y, noise in rows]
 

@@ -28,6 +28,7 @@ class Diagnosis:
     where: dict = dataclasses.field(default_factory=dict)
     check: tuple = ()
     check_left_out: tuple = ()
+    cleaned_checks: tuple = dataclasses.field(default=(), repr=False)  # recordings as the repaired model is held against, those left to check
     next_experiment: dict | None = None
     base: object = None
     repaired: object = None

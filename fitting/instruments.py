@@ -315,4 +315,5 @@ def _joined(known, found, plain, final, check_plain, check, bench, texts):
         base=plain,
         repaired=final,
         check=tuple(checks),
+        cleaned_checks=(),
     )

@@ -10,7 +10,7 @@ from magjax.recording import stray_samples
 from .floors import swapped
 from .memories import RESTS
 from .result import RecordingFit
-from .spectra import hum_on_lines
+from .spectra import hum_part
 
 LOST, AT_BOUND = 1e5, 100.0  # chi2/N from which a fit has led nowhere, and one with a parameter at its bound
 SLOW, MOST_STROKE = 0.3, 1.1  # of f0, below which a rod moves as its strain does; of the rod's reach, that noise may add
@@ -51,10 +51,8 @@ def recording_fits(problem, residual, recordings, bench):
         finite = np.isfinite(deviations[k])
         number = 2 * finite.sum() - finite[0]
         chi2 = float((real[k] ** 2).sum() + (imag[k] ** 2).sum())
-        misfit = np.where(finite, deviations[k], 0.0)
-        power = (real[k] * misfit) ** 2
-        power[1:] += (imag[k] * misfit[1:]) ** 2
-        power = np.maximum(np.sqrt(power) - hum_on_lines(s, H), 0.0) ** 2
+        misfit = np.where(finite, deviations[k], 0.0) * (real[k] + 1j * np.append(0.0, imag[k]))
+        power = np.abs(misfit - hum_part(misfit, s)) ** 2
         power[1:] *= 2
         power[0] *= not s.zero  # a zero of its own is no error
         between = float(np.mean(s.residue**2))

@@ -50,6 +50,7 @@ class Reached:
     `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were;
     `foretell`: what fits say of the check recordings; `under_way`: trials by name of a round that has not come to its end;
     `unsure`: the score that what that round finds must reach with what check recordings say for it, 0 where they need not;
+    `hidden`: names of effects adopted though nothing scored, for what check recordings say;
     `late`: whether the time was over before the search was through; `partial`: whether what was reached stands on a round that
     did not come to its end.
     """
@@ -61,6 +62,7 @@ class Reached:
     foretell: Foreteller | None = None
     under_way: dict = dataclasses.field(default_factory=dict)
     unsure: float = 0.0
+    hidden: tuple = ()
     late: bool = False
     partial: bool = False
 
@@ -145,6 +147,7 @@ def _forward(task, base, state, candidates, check, ends, free_means):
         found, good, task = refitted(task, state.current, best, good, excess, any_rest, not promises(base, best.result, left))
         candidates = left if found.result is best.result else screened(found.result, task.choices)
         state.adopt(found, good)
+        state.hidden += (found.name,) if hidden else ()
         let_go()
         if ends(state.current):
             return task, made_up, True

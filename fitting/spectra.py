@@ -263,23 +263,12 @@ def line_deviations(spectrum: Spectrum, noise: Noise) -> np.ndarray:
     return np.sqrt(variance if spectrum.systematic is None else variance + spectrum.systematic**2)
 
 
-def hum_on_lines(spectrum: Spectrum, count: int) -> np.ndarray:
-    """What hum of an unknown phase may add to lines 0 to `count` - 1 of the reading: the size of its coefficient, unit."""
-    lowest, found = spectrum.frequency / max(spectrum.periods, 1), np.zeros(count)
+def hum_part(errors: np.ndarray, spectrum: Spectrum) -> np.ndarray:
+    """As much of the errors of lines 0.. of the reading as may be hum that stands on them, whose phase nothing tells there."""
+    lowest, sizes = spectrum.frequency / max(spectrum.periods, 1), np.zeros(len(errors))
     for tone, amplitude in spectrum.hum or ():
-        found[np.abs(np.arange(count) * spectrum.frequency - tone) < ON_LINE * lowest] += amplitude / 2
-    return found
-
-
-def without_hum(error, spectrum: Spectrum) -> np.ndarray:
-    """An error over the samples of a record, without as much of it as may be hum that stands on lines of the drive."""
-    sizes = hum_on_lines(spectrum, len(spectrum.reading))
-    phases = np.arange(len(error)) * spectrum.dt * spectrum.frequency
-    for order in np.flatnonzero(sizes):
-        turn = np.exp(2j * np.pi * order * phases)
-        line = np.mean(error * np.conj(turn))
-        error = error - 2 * (line * turn).real * min(1.0, sizes[order] / max(abs(line), 1e-300))
-    return error
+        sizes[np.abs(np.arange(len(errors)) * spectrum.frequency - tone) < ON_LINE * lowest] += amplitude / 2
+    return errors * np.minimum(1.0, sizes / np.maximum(np.abs(errors), 1e-300))
 
 
 def gain_rows(spectra, deviations):

@@ -41,6 +41,10 @@ BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as th
 ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 PLAIN_TEXT = "The model offered is the plain one, which predicts the check recordings better than any repair."
+HIDDEN_TEXT = (
+    " The fitted recordings alone do not show {}, for a density does nearly the same (chi2 falls by {:.0f}); it is named for the check recordings, "
+    "which speak for it by {:.0f}."
+)
 UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 
@@ -70,6 +74,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     common = {
         "floors": evidence.floors, "where": evidence.where, "absorbed": evidence.absorbed, "base": evidence.raw, "check": rows,
         "candidates": achieved(evidence), "repaired": current if steps or evidence.adopted else None,
+        "cleaned_checks": tuple(clean) if evidence.adopted else (),
     }  # fmt: skip
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
     foretold = before > WELL_FORETOLD[0] * len(rows) and after < WELL_FORETOLD[1] * before
@@ -107,6 +112,9 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         elif (slow := creeps_on(effect, evidence)) and CREEPS_TEXT.format(slow) not in form:
             form += CREEPS_TEXT.format(slow)
     form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
+    for best, _, _, previous in steps:
+        if best.name in evidence.reached.hidden:
+            form += HIDDEN_TEXT.format(best.name, best.drop, evidence.reached.foretell.says_for(best.result, previous))
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
 
 
@@ -252,7 +260,7 @@ def _fall(evidence) -> str:
 
 def unexplained(evidence, found) -> Diagnosis:
     """The `unknown_at` in place of a verdict that named an effect."""
-    names = ("floors", "where", "absorbed", "base", "check", "candidates", "repaired")
+    names = ("floors", "where", "absorbed", "base", "check", "candidates", "repaired", "cleaned_checks")
     return _unknown(evidence, {name: getattr(found, name) for name in names})
 
 

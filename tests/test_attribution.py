@@ -219,7 +219,7 @@ def test_a_feedback_that_the_density_hides_is_sought_where_checks_are_missed(mon
     monkeypatch.setattr(fitting.search, "refitted", lambda task, now, best, good, *a: (best, good, task))
     monkeypatch.setattr(fitting.search, "_once_more", lambda *a: None)
     found = fitting.search.search(Task((), None), base, HIDDEN, ("check",))
-    assert asked[:1] == tried and [best.name for best, *_ in found.steps] == named
+    assert asked[:1] == tried and [best.name for best, *_ in found.steps] == list(found.hidden) == named
 
 
 @pytest.mark.parametrize(("left", "starts", "ends"), [(1.0, [1e10], 0.98), (2.0, [], 0.99)], ids=["meets the noise", "a misfit"])
@@ -569,6 +569,21 @@ def evidence_of(monkeypatch, chi2n, before, after):
 def test_a_repair_that_leaves_much_or_foretells_worse_is_not_named(monkeypatch, chi2n, before, after, word):
     """One of two check recordings may get better and the other far worse: together they are worse."""
     assert fitting.verdict.verdict(evidence_of(monkeypatch, chi2n, before, after)).verdict == word
+
+
+@pytest.mark.parametrize(("hidden", "told"), [(("creep",), True), ((), False)])
+def test_what_check_recordings_alone_name_is_told(monkeypatch, hidden, told):
+    """The ranking shows it below the threshold, and its size stands at two of its errors."""
+    evidence = evidence_of(monkeypatch, 1.0, (7.0, 8.0), (1.05, 1.3))
+    evidence.reached.hidden = hidden
+
+    class Foretell:
+        says_for, beside = staticmethod(lambda after, before: 58.2), staticmethod(lambda rows, fit: rows)
+
+    evidence.reached.foretell = Foretell()
+    found = fitting.verdict.verdict(evidence)
+    assert found.verdict == "attributed"
+    assert ("do not show creep" in found.message and "speak for it by 58." in found.message) is told
 
 
 @pytest.mark.parametrize(("expected", "word"), [(True, "attributed"), (False, "unknown_at")])

@@ -5,15 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fitting.check import check_errors
+from fitting.check import all_lines, check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.fit import fit
 from fitting.on_lines import hum_score
 from fitting.record_level import hum_is_seen
+from fitting.report.evidence import of_checks
 from fitting.setup import Choices, spectra_of
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
+from magjax.recording import Recording
+from magjax.simulate import simulate
 
 BENCH = load_bench("aa-050h")
 DRIVES = ((10, 0.8, 0.1), (25, 0.5, -0.2), (50, 0.6, 0.1), (100, 0.5, -0.1), (170, 0.7, 0.1), (230, 0.5, -0.2))
@@ -57,6 +60,36 @@ def test_hum_must_show_between_the_harmonics_where_it_can():
     assert not hum_is_seen(spectra_of(recorded(drives=(off, on)), BENCH), tones)
     assert hum_is_seen(spectra_of(recorded(HUM, (off, on)), BENCH), tones)
     assert hum_is_seen(spectra_of(recorded(drives=(on,)), BENCH), tones)  # it cannot show
+
+
+def test_a_check_recording_is_drawn_as_its_number_says():
+    """Title and strip of one figure: 25 nm beside a sine of 170 nm, which was the hum on a line."""
+    truth = concealed_actuator(BENCH)
+    row = record(truth, 10.0, 0.6, 0.1, np.random.default_rng(3), "10 Hz")
+    wave = 5 * HUM * np.sin(2 * np.pi * 50.0 * row.time + 1.1)
+    raw = dataclasses.replace(row, channels={**row.channels, "displacement": row.channels["displacement"] + wave})
+    clean = dataclasses.replace(raw, origin={**row.origin, "hum": ((50.0, 5 * HUM),)})
+    numbers = check_errors(truth, truth, [raw], BENCH, [clean])[0]
+    entry = of_checks(truth, truth, [raw], BENCH, cleaned=[clean])["0"]
+    before, after = (np.sqrt(np.mean((entry[k] - entry[m]) ** 2)) for k, m in (("before", "recorded"), ("after", "measured")))
+    assert before == pytest.approx(numbers["rms_before"], rel=0.1) and before > 2e-7
+    assert after < numbers["rms_after"] < 1.2 * numbers["noise_rms"]
+
+
+def test_a_multisine_is_drawn_though_hum_had_hidden_its_many_lines():
+    """Beside a hum of 2 um the lines beyond the fortieth tell nothing: without it the reading has 161 of them."""
+    rng, phase, truth = np.random.default_rng(4), np.arange(4 * 1600) / 1600, BENCH.actuator()
+    current = 0.05 + sum(0.09 * np.sin(2 * np.pi * (k * phase + rng.random())) for k in (3, 7, 11, 13, 17, 19, 23, 27, 31, 33, 37))
+    reading = np.tile(np.asarray(simulate(truth, current[:1600], 1 / (1600 * 7.0), periodic=True).displacement), 4)
+    reading += 4e-8 * rng.standard_normal(len(phase))
+    wave = 2e-6 * np.sin(2 * np.pi * 50.0 * phase / 7.0)
+    raw, clean = (
+        Recording(phase / 7.0, {"current": current, "displacement": y}, {}, origin, "multisine")
+        for y, origin in ((reading + wave, {}), (reading, {"hum": ((50.0, 2e-6),)}))
+    )
+    assert len(all_lines(raw, BENCH).reading) < len(all_lines(clean, BENCH).reading)
+    entry = of_checks(truth, truth, [raw], BENCH, cleaned=[clean])["0"]
+    assert np.sqrt(np.mean((entry["after"] - entry["measured"]) ** 2)) < 8e-8
 
 
 @pytest.mark.parametrize(("other", "left"), [(0.0, 0.0), (4.0, 3.0)], ids=["hum alone", "more than hum"])

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..inversion import mass_errors
 from ..joint import data_residual, fields
-from ..spectra import evaluate_lines
+from ..spectra import evaluate_lines, hum_part
 from ..uncertainty import visited_cells
 from .residuals import autocorrelation, by_field_and_rate, by_phase, traces
 
@@ -58,7 +58,7 @@ def of_fit(result, inside: bool = True, chosen=None) -> dict:
 
 def model_misfit(result) -> np.ndarray:
     """Fourier coefficients of model less measurement, (recordings, harmonics + 1), unit of the reading; without the mean of a
-    recording that has a zero of its own."""
+    recording that has a zero of its own, and hum that stands on a line."""
     problem = result.problem
     residual = data_residual(problem, result.solution.z)
     R, H = problem.target.lines.shape
@@ -66,7 +66,8 @@ def model_misfit(result) -> np.ndarray:
     misfit[:, 1:] += 1j * residual[R * H :].reshape(R, H - 1)
     misfit[[s.zero > 0 for s in problem.spectra], 0] = 0.0
     deviations = np.asarray(problem.target.deviations)
-    return misfit * np.where(np.isfinite(deviations), deviations, 0.0)
+    misfit *= np.where(np.isfinite(deviations), deviations, 0.0)
+    return misfit - np.stack([hum_part(m, s) for m, s in zip(misfit, problem.spectra, strict=True)])
 
 
 def chosen_recordings(result, count: int = SHOWN) -> list[int]:
@@ -200,8 +201,9 @@ def _inside(result, chosen) -> dict:
     return found
 
 
-def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict:
-    """Measured and predicted periods of check recordings, before and after a repair; `own_zeros`: which leaves each its level."""
+def of_checks(before, after, recordings, bench, own_zeros: bool = False, cleaned=()) -> dict:
+    """Measured and predicted periods of check recordings, before and after a repair; `own_zeros`: which leaves each its level;
+    `cleaned`: them without what the repair finds between the harmonics, if it does."""
     from ..check import HARMONICS, all_lines, predicted_periods
 
     found = {}
@@ -209,16 +211,19 @@ def of_checks(before, after, recordings, bench, own_zeros: bool = False) -> dict
     spectra = [all_lines(recordings[k], bench) for k in periodic]
     if not spectra:
         return found
+    clean = [all_lines(cleaned[k], bench) for k in periodic] if cleaned else spectra  # more lines may tell where less is beside them
     first = predicted_periods(before, spectra)
-    lines = {"before": first, "after": first if after is before else predicted_periods(after, spectra)}
-    for at, (k, s) in enumerate(zip(periodic, spectra, strict=True)):
+    lines = {"before": first, "after": first if after is before and not cleaned else predicted_periods(after, clean)}
+    for at, (k, s, own) in enumerate(zip(periodic, spectra, clean, strict=True)):
         recording = recordings[k]
-        bins = BINS if len(s.reading) <= HARMONICS + 1 else 4 * BINS  # loops of many lines turn often
+        bins = BINS if len(own.reading) <= HARMONICS + 1 else 4 * BINS  # loops of many lines turn often
         phases, residue, count = by_phase(s, s.residue, bins)
-        measured = evaluate_lines(s.reading, phases) + residue
+        recorded = evaluate_lines(s.reading, phases) + residue
+        hum = hum_part(own.reading - lines["after"][at][: len(own.reading)], own)
+        measured = evaluate_lines(own.reading - hum, phases) + by_phase(own, own.residue, bins)[1]
         entry = {
             "name": np.array(_short(recording.origin.get("file", recording.name))), "frequency": np.array(s.frequency), "phase": phases,
-            "drive": s.drive_at(phases), "measured": measured, "noise": s.noise_rms / np.sqrt(np.maximum(count, 1)),
+            "drive": s.drive_at(phases), "measured": measured, "recorded": recorded, "noise": s.noise_rms / np.sqrt(np.maximum(count, 1)),
         }  # fmt: skip
         for key in ("before", "after"):
             predicted = evaluate_lines(lines[key][at], phases)

@@ -69,7 +69,7 @@ def checks(entries, output: str, drive: str, rows, repaired: bool = True, added:
     for key, entry in list(entries.items())[:SHOWN]:
         row = rows[int(key)]
         loop = {**entry, "model": entry["before"]}
-        strips = [("model", "before", entry["before"] - entry["measured"])]
+        strips = [("model", "before", entry["before"] - entry.get("recorded", entry["measured"]))]
         if repaired:
             strips.append(("after", "after", entry["after"] - entry["measured"]))
         else:

@@ -70,7 +70,7 @@ def write_diagnosis(
         _, checks = diagnosis.parted(checks)
         if checks:
             own_zeros = any(s.zero for s in best.spectra)
-            found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench, own_zeros)
+            found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench, own_zeros, diagnosis.cleaned_checks)
     store.save(folder, found)
     rebuild(folder, progress)
 
