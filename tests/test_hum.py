@@ -90,6 +90,7 @@ def test_a_multisine_is_drawn_though_hum_had_hidden_its_many_lines():
     assert len(all_lines(raw, BENCH).reading) < len(all_lines(clean, BENCH).reading)
     entry = of_checks(truth, truth, [raw], BENCH, cleaned=[clean])["0"]
     assert np.sqrt(np.mean((entry["after"] - entry["measured"]) ** 2)) < 8e-8
+    assert entry["noise"].max() < 8e-8  # of the reading that is drawn
 
 
 @pytest.mark.parametrize(("other", "left"), [(0.0, 0.0), (4.0, 3.0)], ids=["hum alone", "more than hum"])

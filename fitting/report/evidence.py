@@ -223,7 +223,7 @@ def of_checks(before, after, recordings, bench, own_zeros: bool = False, cleaned
         measured = evaluate_lines(own.reading - hum, phases) + by_phase(own, own.residue, bins)[1]
         entry = {
             "name": np.array(_short(recording.origin.get("file", recording.name))), "frequency": np.array(s.frequency), "phase": phases,
-            "drive": s.drive_at(phases), "measured": measured, "recorded": recorded, "noise": s.noise_rms / np.sqrt(np.maximum(count, 1)),
+            "drive": s.drive_at(phases), "measured": measured, "recorded": recorded, "noise": own.noise_rms / np.sqrt(np.maximum(count, 1)),
         }  # fmt: skip
         for key in ("before", "after"):
             predicted = evaluate_lines(lines[key][at], phases)
