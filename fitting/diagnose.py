@@ -30,6 +30,7 @@ from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
 from .locate import where
 from .own_signals import (
+    drifts_of_one,
     heat_on_harmonics,
     hum_on_harmonics,
     needless_zeros,
@@ -46,6 +47,7 @@ from .rows import DRIFTS
 from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
+from .spoilt import FAR, mended_by, spoilt
 from .task import Clock, Late, Task
 from .verdict import HALF, WORSE, Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
 
@@ -111,10 +113,13 @@ def _diagnosed(task, check) -> Diagnosis:
     if alternation := alternating(recordings, spectra, bench.output):
         return alternation.told(_diagnosed(task.on(recordings=tuple(alternation.cleaned)), check))
     problem = data_problem(recordings, spectra, bench.output)
+    recordings, drifting = drifts_of_one(recordings, spectra, bench)
+    spectra = spectra_of(recordings, bench, choices.harmonics) if drifting else spectra
     adopted, cleaned = record_level(recordings, spectra, bench, choices)
     if problem and (not adopted or data_problem(cleaned, spectra_of(cleaned, bench, choices.harmonics), bench.output)):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=task.fit(refine=False))
     found = _examined(task.on(recordings=tuple(cleaned)), task, adopted, check)
+    found = functools.reduce(Diagnosis.noted, drifting, found)
     if not problem:
         return found
     names = " and ".join("the drift" if effect.name in DRIFTS else effect.name for effect, _ in adopted)
@@ -134,6 +139,9 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     if not max(ratios, default=0.0) > MISSED:
         return _with_unseen_cells(found)
     worst = int(np.argmax(ratios))
+    if why := mended_by((found.repaired or found.base).actuator, check[worst], task.bench):
+        name = check[worst].origin.get("file", check[worst].name).rsplit("/", 1)[-1]
+        return found.noted(f"The check recording {name} contradicts the others: {why}; correct it or leave it out.")
     missed, left = check[worst], [c for k, c in enumerate(check) if k != worst]
     name = missed.origin.get("file", missed.name).rsplit("/", 1)[-1]
     told = f"{name} is missed by {ratios[worst]:.0f} times its noise, though the fit meets its own"
@@ -179,12 +187,30 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
     """The diagnosis of recordings without the record-level effects `adopted`; `measured`: the task with them as they came,
     `plain`: a fit of theirs, where it is known; `before_zeros`: task and adopted before zeros of the recordings were; `zeros`:
     whether these may be."""
-    plain = task.fit() if plain is None else plain
+    first, plain = plain is None, task.fit() if plain is None else plain
     try:
-        return _explained(task, measured, adopted, check, plain, before_zeros, zeros)
+        far = plain.chi2_per_sample > FAR
+        suspect = _spoilt(task, plain) if first and far else None
+        if suspect is None or not suspect.certain:
+            found = _explained(task, measured, adopted, check, plain, before_zeros, zeros)
+            if not first or found.verdict != "unknown_at":
+                return found
+            suspect = suspect if far else _spoilt(task, plain)
+        if suspect is None:
+            return found
+        if suspect.certain:
+            return Diagnosis("data_problem", f"{suspect.told}.", data_problem=suspect.told, base=plain)
+        return found.noted(f"{suspect.told}.")
     except KeyboardInterrupt as stop:  # what was reached
         stop.plain = getattr(stop, "plain", plain)
         raise
+
+
+def _spoilt(task, plain):
+    """What speaks against the recordings; None where nothing does, or no time is left to ask."""
+    with contextlib.suppress(Late):
+        return spoilt(task.sparing, plain)
+    return None
 
 
 def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Diagnosis:

@@ -14,6 +14,7 @@ MISSED_SHARE = 0.4  # of a reading that changes sign in one recording alone: its
 SWAPPED, ONE_SWAPPED = 20.0, 1e4  # chi2/N from which a sign may be swapped: in all recordings, in one (loops may turn about zero M)
 MOST = 0.8  # share of the recordings that must show it
 RESTLESS = 5.0  # mean square of the first period between its harmonics over the white noise
+COARSE = 20  # samples a period, below which harmonics fall between those that are read
 NO_DRIFT = 0.25  # share of the change from the first period to the last that a drift must leave for a transient
 
 
@@ -28,6 +29,18 @@ def solver_floor(problem, solution) -> float:
 
 def data_problem(recordings, spectra, output) -> str | None:
     """What is wrong with the data themselves, in one sentence with the mend; None where nothing is."""
+    problem = _unsettled(recordings, spectra, output)
+    coarse = min(spectra, key=lambda s: s.samples / s.periods)
+    if problem and coarse.samples / coarse.periods < COARSE and problem.startswith(coarse.name) and "drifts" not in problem:
+        return (
+            f"{coarse.name}: {coarse.samples / coarse.periods:.3g} samples a period are too few: what repeats and what does not cannot be "
+            f"told apart; sample {COARSE} times a period at least, and so many times that periods end on a sample"
+        )
+    return problem
+
+
+def _unsettled(recordings, spectra, output) -> str | None:
+    """A recording, or most of them, that does not repeat, in words."""
     widest = max(s.peak_to_peak for s in spectra)
     for recording, s in zip(recordings, spectra, strict=True):
         if s.periods >= 2:
@@ -83,10 +96,11 @@ def _reading(recording, s, output):
 
 
 def _by_period(s, y):
-    """The samples period by period, (periods, samples); periods need not divide the sampling."""
+    """The samples less what repeats, period by period, (periods, samples); periods need not divide the sampling."""
     step = int(s.samples / s.periods)
     cycles = np.arange(s.samples) * s.dt * s.frequency
-    return np.stack([np.interp(k + np.arange(step) / step, cycles, y) for k in range(s.periods)])
+    left = fit_lines(y, cycles, len(s.reading) - 1)[1]
+    return np.stack([np.interp(k + np.arange(step) / step, cycles, left) for k in range(s.periods)])
 
 
 def _changes(blocks):

@@ -12,7 +12,17 @@ from .attribute import BIC_DROP, CLOSE, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEA
 from .diagnosis import SILENT_CHI2, Diagnosis, least_excess
 from .finer import FINER_FROM
 from .on_lines import heat_score, hum_score, offset_score, zeros_score
-from .record_level import by_heat, hum_is_seen, hum_of, pulsation_of, record_effects, remove_record_effect, zeros_of
+from .record_level import (
+    by_heat,
+    hum_is_seen,
+    hum_of,
+    lone_drifts,
+    pulsation_of,
+    record_effects,
+    remove_record_effect,
+    without_lone_drifts,
+    zeros_of,
+)
 from .rows import DRIFTS
 from .screen import screened
 from .setup import spectra_of
@@ -26,6 +36,13 @@ MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the 
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics, or a rod's breathing with the heat, must take
 HEAT_PASSES, NOTHING_LEFT = 2, 2.0  # fits that find the rate of a pulsation, and z of what they may leave of it
 HEAT_RATE = 0.5  # of the pulsation, in units of the drift's: what cools fast breathes and drifts no more
+
+
+def drifts_of_one(recordings, spectra, bench):
+    """The recordings without the drift that one of them alone shows, and what there is to say of it, a sentence each."""
+    if bench.quasistatic or bench.output != "displacement":
+        return recordings, []
+    return without_lone_drifts(recordings, lone_drifts(spectra), bench.output)
 
 
 def record_level(recordings, spectra, bench, choices):

@@ -7,13 +7,17 @@ import dataclasses
 
 import numpy as np
 
+from magjax.plausibility import si_unit
 from magjax.recording import Recording
 
 from .spectra import evaluate_lines, fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
-CLEAR_HUM, LEAST_HUM = 25.0, 0.25  # chi2 that hum of a size would take between the harmonics, and the share that must show
+CLEAR, LEAST_SHOWN = 25.0, 0.1  # chi2 that a signal of a size would take between the harmonics, and the share that must show
+MOST_SHOW = 0.5  # of the recordings where a signal would be clear, more of which must show it, or deny it
+LONE_GAIN = 60.0  # fall of chi2 from which a drift of one record may be its alone
+SETTLING = (0.04, 0.15)  # of the record's length: times with which such a record may settle
 AS_ALIKE = 1.02  # spread of drifts per heat in units of that of the drifts, up to which they may as well be heat
 OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record alone, and the share of the longer ones that must show it
 
@@ -62,6 +66,7 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
             found["thermal_drift"] = by_heat(own, spectra)
     for f in MAINS:
         z, tones, fits = _hum(spectra, f)
+        z = z if hum_is_seen(spectra, tones) else 0.0
         if "mains_hum" not in found or z > found["mains_hum"].z:
             error = tones[0][1] / max(z, 1.0)
             found["mains_hum"] = RecordEffect(
@@ -130,22 +135,62 @@ def hum_of(spectra, z: float, tones) -> RecordEffect:
 
 
 def hum_is_seen(spectra, tones) -> bool:
-    """Whether hum of these tones (frequency, Hz, and amplitude) shows between the harmonics of recordings where it must."""
-    fall = promised = 0.0
+    """Whether hum of these tones (frequency, Hz, and amplitude) shows between the harmonics of most recordings where it must."""
+    shown = []
     for s in spectra:
         parts, kinds = _tones(s, [f for f, _ in tones])
         if not parts or s.samples * s.dt < 2 / tones[0][0]:
             continue
-        fall += _combination([reduced for _, reduced in parts])[1] - len(parts)
+        fall = _combination([reduced for _, reduced in parts])[1] - len(parts)
         power = [np.sum(weight * np.abs(c) ** 2) for _, (weight, _, c) in parts]
-        promised += float(np.sum(np.square([tones[k][1] for k in kinds]) * power) / 2)
-    return promised < CLEAR_HUM or fall > LEAST_HUM * promised
+        promised = float(np.sum(np.square([tones[k][1] for k in kinds]) * power) / 2)
+        if promised > CLEAR:
+            shown.append(fall > LEAST_SHOWN * promised)
+    return not shown or bool(np.mean(shown) > MOST_SHOW)
 
 
-def drift_of(s):
-    """The drift of one record by itself, straight and by the root of time, from zero at its start: (fall of chi2, samples)."""
+def lone_drifts(spectra) -> dict:
+    """Drifts that one record alone shows, though at its rate, or by its heat, most others would: {recording: samples}."""
+    gains, fits = zip(*(drift_of(s) for s in spectra), strict=True)
+    heat, lone = mean_heat(spectra), {}
+    for k, (gain, fit) in enumerate(zip(gains, fits, strict=True)):
+        others = [n for n in range(len(spectra)) if n != k]
+        if gain < LONE_GAIN or len(others) < 2 or np.median([gains[n] for n in others]) > OWN_GAIN:
+            continue
+        rate = fit[-1] / (spectra[k].dt * spectra[k].samples)
+        denied = 0
+        for n in others:
+            weight, _, column = _between(spectra[n], spectra[n].dt * np.arange(spectra[n].samples))
+            promised = (rate * min(1.0, heat[n] / heat[k])) ** 2 * np.sum(weight * np.abs(column) ** 2)
+            denied += promised > CLEAR and gains[n] < LEAST_SHOWN * promised
+        if denied >= max(2, MOST_SHOW * len(others)):
+            lone[k] = drift_of(spectra[k], SETTLING)[1]
+    return lone
+
+
+def without_lone_drifts(recordings, lone, output):
+    """The recordings without the drifts that some of them alone show, and what is to be told of each in words."""
+    cleaned, told = list(recordings), []
+    for k, fit in lone.items():
+        reading = np.asarray(recordings[k].channels[output], float)
+        origin = {**recordings[k].origin, "zero": float(np.ptp(reading))}  # where it settles is not known
+        cleaned[k] = dataclasses.replace(recordings[k], channels={**recordings[k].channels, output: _less(reading, fit)}, origin=origin)
+        told.append(
+            f"{recordings[k].name} alone drifts, by {np.ptp(fit):.3g} {si_unit(output)}, which was taken out: it was not settled, or its sensor moved."
+        )
+    return cleaned, told
+
+
+def _less(reading, signal):
+    """A reading less a signal of its first samples, which keeps its last value beyond them."""
+    return np.asarray(reading, float) - np.append(signal, np.full(len(reading) - len(signal), signal[-1]))
+
+
+def drift_of(s, settling=()):
+    """The drift of one record by itself, straight and by the root of time, and settling with some times in units of its length,
+    from zero at its start: (fall of chi2, samples)."""
     t = s.dt * np.arange(s.samples)
-    parts = [t / t[-1], np.sqrt(t / t[-1])]
+    parts = [t / t[-1], np.sqrt(t / t[-1]), *(1 - np.exp(-t / (tau * t[-1])) for tau in settling)]
     best, gain = _combination([_between(s, p) for p in parts])
     return gain, sum(x * p for x, p in zip(best, parts, strict=True))
 
@@ -235,12 +280,8 @@ def remove_record_effect(recordings, effect, output):
         return [dataclasses.replace(r, origin={**r.origin, "zero": size}) for r in recordings]
     cleaned = []
     for recording, column in zip(recordings, effect.columns, strict=True):
-        signal = np.zeros(len(recording.time))
         scale = 1.0 if effect.name == "mains_hum" or effect.shapes.get("own") else effect.amplitude
-        signal[: len(column)] = scale * column
-        if len(column) < len(signal):
-            signal[len(column) :] = signal[len(column) - 1]
-        channels = {**recording.channels, output: recording.channels[output] - signal}
+        channels = {**recording.channels, output: _less(recording.channels[output], scale * column)}
         origin = recording.origin
         if effect.name == "mains_hum":
             origin = {**origin, "hum": effect.shapes["tones"]}

@@ -45,7 +45,9 @@ HIDDEN_TEXT = (
     " The fitted recordings alone do not show {}, for a density does nearly the same (chi2 falls by {:.0f}); it is named for the check recordings, "
     "which speak for it by {:.0f}."
 )
-UNSEEN = ("coil.c0", "coil.H_bias", "magnetostriction.lambda_s")  # constants that R_eddy and the density make up for
+UNSEEN = (  # constants that R_eddy and the density make up for
+    "coil.c0", "coil.H_bias", "coil.N_m", "coil.A_m", "magnetostriction.lambda_s", "magnetostriction.l_rod",
+)  # fmt: skip
 FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 
 
@@ -205,7 +207,9 @@ def _silent(evidence, common, dropped, rough) -> Diagnosis:
         text += ROUGH_TEXT
     if evidence.absorbed:
         text += f" These recordings could not show {', '.join(evidence.absorbed)}: the density absorbs them."
-    held = [n.split(".")[1] for n in UNSEEN if n not in evidence.bench.free]
+    if len(evidence.recordings) == 1:
+        text += " One recording tells little: record at other frequencies, amplitudes and offsets."
+    held = [n.split(".")[1] for n in UNSEEN if n in evidence.bench.constants and n not in evidence.bench.free]
     if held and evidence.bench.drive == "current" and evidence.bench.output == "displacement":
         text += f" A wrong {', '.join(held[:-1])}{' or ' if held[1:] else ''}{held[-1]} in the bench file would not show here either: R_eddy and the density take it up."
     return Diagnosis("nothing_missing", text, **common)

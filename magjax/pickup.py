@@ -69,6 +69,16 @@ def bridge_gaps(time, channels, drive):
     return dt * full, filled, missing
 
 
+def without_empty(time, channels):
+    """The samples without those that lack a channel (empty cells), as if they had not been taken: a gap, which `bridge_gaps` fills;
+    (time, channels). All of them where these are too many to be filled: `Recording` says where they lie."""
+    lacking = np.any([np.isnan(v) for v in channels.values()], axis=0)
+    if not lacking.any() or lacking.sum() > MOST_MISSING * len(time):
+        return time, channels
+    whole = {q: v[~lacking] for q, v in channels.items()}
+    return time[~lacking] - time[~lacking][0], whole
+
+
 def without_strays(time, channels, drive):
     """A periodic run with single samples far off, as interference leaves, put where their harmonics are: (channels, {channel: how many}).
 

@@ -10,9 +10,11 @@ from .clipping import refuse_clipping
 from .columns import USUAL, column_of, quantity_of
 from .errors import ConfigurationError, RecordingError
 from .formats import read_table
-from .pickup import bridge_gaps, integrate_emf, merge_captures, without_strays
+from .pickup import bridge_gaps, integrate_emf, merge_captures, without_empty, without_strays
 from .plausibility import check_sizes
 from .recording import BYSTANDERS, Recording, refuse_constant
+
+WRITTEN = 1e-5  # of a channel's range: more digits than that are written
 
 
 def load_recordings(paths, bench) -> list[Recording]:
@@ -100,6 +102,22 @@ def refuse_absent_and_twice(recordings, checks=(), more=()) -> None:
             counts = "a check that is also fitted checks nothing" if before != what else "it would count twice"
             raise ConfigurationError(f"{path}: {same}; {counts}: leave one out")
         seen[content] = path, what
+
+
+def refuse_copies(recordings, checks, bench) -> None:
+    """Raise `ConfigurationError` where two recordings hold the same samples of drive and reading, saved in files that differ."""
+    rows = [(r, what) for what, group in (("recording", recordings), ("check", checks)) for r in group]
+    for k, (recording, what) in enumerate(rows):
+        for other, before in rows[:k]:
+            if all(_same_samples(recording.channels[q], other.channels[q]) for q in (bench.drive, bench.output)):
+                counts = "a check that is also fitted checks nothing" if before != what else "it would count twice"
+                raise ConfigurationError(f"{recording.name}: holds the samples of {other.name}; {counts}: leave one out")
+
+
+def _same_samples(one, other) -> bool:
+    """Whether two channels are equal but for the digits that they were written with."""
+    one, other = np.asarray(one, float), np.asarray(other, float)
+    return one.shape == other.shape and bool(np.max(np.abs(one - other)) <= WRITTEN * np.ptp(one))
 
 
 def read_columns(path: Path, bench, quantities) -> dict:
@@ -208,6 +226,7 @@ def _one(name, columns, units, origin, bench) -> Recording:
     if not quasistatic:
         if not np.median(np.diff(time)) > 0:
             raise RecordingError(f"{name}: time does not increase from most samples to the next; rewrite the time column")
+        time, channels = without_empty(time, channels)
         widest = int(round(np.diff(time).max() / max(float(np.median(np.diff(time))), 1e-300))) - 1
         channels, strays = without_strays(time, channels, bench.drive)
         if strays:

@@ -150,7 +150,7 @@ def spoil(kind):
     if kind == "um for m":
         rows[:, 2] *= 1e6
     if kind == "NaN":
-        rows[100, 2] = np.nan
+        rows[100:300, 2] = np.nan
     if kind == "gap":
         rows[300:, 0] += 0.013
     if kind == "clipped":
@@ -281,16 +281,19 @@ def test_an_interrupted_diagnosis_keeps_the_plain_fit(folder, capsys, monkeypatc
 @pytest.mark.parametrize(
     ("again", "why"),
     [(["--check", "{0}"], "a check that is also fitted checks nothing"), (["{1}"], "is given twice; it would count twice"),
-     (["{copy}"], "holds the same as"), (["--check", "{none}"], "no such file")],
-    ids=["fitted and to check", "twice", "a copy", "not there"],
+     (["{copy}"], "holds the same as"), (["{again}"], "holds the samples of"), (["--check", "{again}"], "a check that is also fitted"),
+     (["--check", "{none}"], "no such file")],
+    ids=["fitted and to check", "twice", "a copy", "saved again", "saved again to check", "not there"],
 )  # fmt: skip
 def test_files_that_are_not_there_or_given_twice_are_refused_first(folder, tmp_path, capsys, command, again, why):
     files = sorted(folder.glob("rec_*.csv"))
     copy, kept = tmp_path / "copy.csv", tmp_path / "out"
     copy.write_bytes(files[0].read_bytes())
+    again_saved = tmp_path / "again.csv"
+    again_saved.write_text(files[0].read_text() + "\n\n")
     kept.mkdir()
     (kept / "diagnosis.json").write_text("{}")  # of an earlier diagnosis
-    more = [a.format(*files, copy=copy, none=tmp_path / "none.csv") for a in again]
+    more = [a.format(*files, copy=copy, again=again_saved, none=tmp_path / "none.csv") for a in again]
     assert main([command, *map(str, files), *more, "--bench", "aa-050h", "--out", str(kept)]) in (2, 3)
     said = capsys.readouterr().err
     assert why in said and len(said.strip().splitlines()) == 1

@@ -638,6 +638,18 @@ def test_periods_that_do_not_divide_are_no_data_problem():
     assert data_problem([run], spectra_of([run], bench), "displacement") is None
 
 
+@pytest.mark.parametrize(("per", "words"), [(8.06, None), (40.3, None), (8.06, "8 samples a period are too few")])
+def test_few_samples_a_period_are_no_transient(per, words):
+    """Between so few samples a straight line is no loop; where they do not settle, it is they that cannot tell."""
+    bench, rng = load_bench("aa-050h"), np.random.default_rng(2)
+    t = np.arange(int(6 * per)) / (300.0 * per)
+    current = 0.5 * np.sin(2 * np.pi * 300.0 * t)
+    settling = 1e-5 * np.exp(-(((t - 1.5e-3) / 1e-3) ** 2)) if words else 0.0  # a bump in the first period
+    run = Recording(t, {"current": current, "displacement": 3e-5 + 4e-5 * current + settling + 4e-8 * rng.standard_normal(len(t))}, name="coarse")
+    found = data_problem([run], spectra_of([run], bench), "displacement")
+    assert found is None if words is None else words in found
+
+
 def test_a_swapped_sign_is_a_data_problem(bench):
     runs, _ = study(bench)
     swapped = [

@@ -7,6 +7,7 @@ import pytest
 
 from fitting.diagnosis import Diagnosis
 from fitting.floors import data_problem
+from fitting.own_signals import drifts_of_one
 from fitting.record_level import record_effects, remove_from_checks, remove_record_effect
 from fitting.setup import spectra_of
 from magjax.bench import load_bench
@@ -134,3 +135,24 @@ def test_check_recordings_lose_heat_at_the_amplitude_that_the_others_show():
         for x in (check, *remove_from_checks([check], [heat], BENCH))
     )
     assert after < 0.2 * before
+
+
+def test_a_drift_of_one_record_alone_is_taken_out_of_it_and_told():
+    """It was called hum: any wave of its length bends like a hum between the harmonics of that record."""
+    runs = records()
+    t = runs[1].time
+    for extra in (5e-7 * t / t[-1], 6e-7 * np.exp(-8 * t / t[-1])):
+        spoilt = [*runs[:1], Recording(t, {**runs[1].channels, "displacement": runs[1].channels["displacement"] + extra}, name="50 Hz"), *runs[2:]]
+        assert next(e for e in scored(spoilt) if e.name == "mains_hum").z < 8
+        cleaned, told = drifts_of_one(spoilt, spectra_of(spoilt, BENCH), BENCH)
+        assert len(told) == 1 and told[0].startswith("50 Hz alone drifts")
+        assert [bool(r.origin.get("zero")) for r in cleaned] == [False, True, False, False]  # where it settles is not known
+        left = cleaned[1].channels["displacement"] - runs[1].channels["displacement"]
+        assert np.std(left) < 0.25 * np.std(extra)
+
+
+@pytest.mark.parametrize("frequencies", [FREQUENCIES, (10.0, 300.0, 400.0, 500.0)], ids=["shown by most", "shown by the long one"])
+@pytest.mark.parametrize("rate", [0.0, 2e-6, 2e-5])
+def test_what_the_others_may_share_is_no_drift_of_one(frequencies, rate):
+    runs = records(lambda t: rate * t, frequencies)
+    assert drifts_of_one(runs, spectra_of(runs, BENCH), BENCH) == (runs, [])

@@ -290,3 +290,18 @@ def test_points_and_labels_that_are_no_numbers_are_told_with_their_file(tmp_path
         table = rows(head="current_A,flux_density_T", columns=(drive, READING))
         with pytest.raises(RecordingError, match=f"loops.csv.*{why}"):
             read(tmp_path, table, "loops.csv", own)
+
+
+@pytest.mark.parametrize(("empty", "filled"), [([7], True), (range(300, 340), True), (range(300, 400), False)])
+def test_empty_cells_of_a_periodic_run_are_filled_from_its_harmonics(tmp_path, empty, filled):
+    """The mend that a spike or an infinite sample is given."""
+    reading = READING.copy()
+    reading[list(empty)] = np.nan
+    text = rows(columns=(TIME, CURRENT, reading)).replace("nan", "")
+    if not filled:
+        with pytest.raises(RecordingError, match="not a number at sample 300"):
+            read(tmp_path, text)
+        return
+    found = read(tmp_path, text)
+    assert len(found.time) == len(TIME) and found.origin["metadata"]["bridged_samples"] == len(empty)
+    assert np.abs(found.channels["displacement"] - READING).max() < 2e-7

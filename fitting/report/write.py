@@ -69,7 +69,7 @@ def write_diagnosis(
             found["repaired"] = evidence.of_fit(repaired, chosen=[int(k) for k in found["base"]["chosen"]])
         _, checks = diagnosis.parted(checks)
         if checks:
-            own_zeros = any(s.zero for s in best.spectra)
+            own_zeros = all(s.zero for s in best.spectra)
             found["checks"] = evidence.of_checks(base.actuator, best.actuator, checks, best.bench, own_zeros, diagnosis.cleaned_checks)
     store.save(folder, found)
     rebuild(folder, progress)

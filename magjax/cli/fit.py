@@ -95,7 +95,7 @@ def run_fit(arguments) -> int:
     options = p.parse_args(arguments)
     check_intervals(options)
     prepare_jax()
-    from magjax.readers import load_checks, load_recordings, refuse_absent_and_twice
+    from magjax.readers import load_checks, load_recordings, refuse_absent_and_twice, refuse_copies
 
     folder = output_folder(options.out)
     refuse_absent_and_twice(options.recordings, options.check)
@@ -117,6 +117,7 @@ def run_fit(arguments) -> int:
     refuse_profile(options, free_parameters(bench, actuator or bench.actuator(), extra))
     recordings = load_recordings(options.recordings, bench)
     checks, refused = load_checks(options.check, bench)
+    refuse_copies(recordings, checks, bench)
     with Progress(options.quiet) as progress:
         result = fit(recordings, bench, actuator=actuator, extra=extra, choices=choices, progress=progress)
         (more, text), stopped = ({}, ""), None
@@ -184,7 +185,7 @@ def run_diagnose(arguments) -> int:
     prepare_jax()
     from magjax.effects import refuse_unknown
     from magjax.errors import RecordingError
-    from magjax.readers import load_calibrations, load_checks, load_sound, refuse_absent_and_twice
+    from magjax.readers import load_calibrations, load_checks, load_sound, refuse_absent_and_twice, refuse_copies
 
     bench, actuator = _bench_and_start(options)
     folder = output_folder(options.out)
@@ -206,6 +207,7 @@ def run_diagnose(arguments) -> int:
         if errors:
             raise errors[0]
         checks, refused = load_checks(options.check, bench)
+        refuse_copies(recordings, checks, bench)
         with Progress(options.quiet) as progress:
             found = diagnose(recordings, bench, check=checks, calibration=load_calibrations(options.calibration, bench), actuator=actuator,
                              choices=Choices(max_jacobians=options.max_jacobians, only=tuple(options.only)), progress=progress,

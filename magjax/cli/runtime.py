@@ -50,9 +50,13 @@ def positive(text: str) -> int:
 
 def minutes(text: str) -> float:
     """A time above zero, inf for no limit, for an option's `type`."""
-    if not float(text) > 0:
-        raise ValueError
-    return float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text} is no time above zero; give minutes, say 10, or inf for no limit")
+    return value
 
 
 def seed(text: str) -> int:
