@@ -56,6 +56,11 @@ def predictions(actuator, recordings, bench) -> list:
     return [(predicted, _levelled(np.asarray(y, float), predicted, r, bench), noise) for r, predicted, y, noise in rows]
 
 
+def prediction(actuator, recording, bench) -> tuple:
+    """(predicted, measured, noise rms) over the samples of one recording (`predictions`)."""
+    return predictions(actuator, [recording], bench)[0]
+
+
 def _levelled(measured, predicted, recording, bench):
     """The reading, at the prediction's mean where its own says nothing: an integrated emf, a zero of this recording's own."""
     free = bench.output == "flux_density" and recording.frequency() is not None

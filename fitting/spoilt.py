@@ -15,7 +15,7 @@ from magjax.plausibility import si_unit
 from magjax.recording import Recording
 
 from .attribute import MISFIT
-from .check import beyond_plane, predictions
+from .check import beyond_plane, prediction, predictions
 
 FEWEST = 4  # recordings, of which three are left
 STANDS_OUT = 2.0  # times the median, that it is missed by (chi2 per number)
@@ -94,7 +94,7 @@ def clock_of_all(task, plain) -> Spoilt | None:
 def mended_by(actuator, recording, bench) -> str | None:
     """The one number that makes up for nearly all by which an actuator misses a recording, in words; None where none does."""
     drive, unit = bench.drive, si_unit(bench.output)
-    predicted, measured, noise = _foretold(actuator, recording, bench)
+    predicted, measured, noise = prediction(actuator, recording, bench)
     left = np.mean((predicted - measured) ** 2) - noise**2
     found = []  # (what is missed yet, words)
     if beyond_plane(actuator, recording, bench) < OUTSIDE:
@@ -121,11 +121,6 @@ def mended_by(actuator, recording, bench) -> str | None:
 def _in_words(factor: float) -> str:
     """A factor; of units, where it is about one."""
     return next((f"{u:g}" for u in UNITS if abs(np.log(factor / u)) < NO_CHANGE), f"{factor:.3g}")
-
-
-def _foretold(actuator, recording, bench):
-    """(predicted, measured, noise rms) of one recording."""
-    return predictions(actuator, [recording], bench)[0]
 
 
 def _delayed(predicted, measured, recording):
@@ -159,7 +154,7 @@ def _by_factor(actuator, recording, bench, changed):
         there = changed(recording, float(np.exp(logarithm)), bench)
         if beyond_plane(actuator, there, bench) >= OUTSIDE:
             return np.full(2, 1e3 * np.ptp(recording.channels[bench.output]))
-        predicted, measured, _ = predictions(actuator, [there], bench)[0]
+        predicted, measured, _ = prediction(actuator, there, bench)
         return predicted - measured
 
     about = np.log(best) + np.array([-step, step])

@@ -59,7 +59,8 @@ def test_are_those_of_the_whole_chain(recordings, kinds, monkeypatch):
 
     first_order = {effect.name: changes(e) for effect, e in zip(small, np.eye(len(small)), strict=True)}
     for kind in asked:
-        shapes, column = found[kind][-1]
+        # a limit that the rod's flux runs into: less flux then asks for less, which the first order leaves out
+        shapes, column = [row for row in found[kind] if "linkage" not in row[0]][-1]
         assert len(found[kind]) == len(shape_grid(kind)) or kind.amplitude in shapes
         if kind.amplitude in shapes:  # scored at a finite size
             whole = predicted_lines(problem.predictors[0], at.with_effect(kind(**shapes))) - predicted_lines(problem.predictors[0], at)

@@ -56,7 +56,7 @@ def test_silent_where_nothing_is_missing(bench):
     assert (
         found.verdict == "nothing_missing"
         and "no effect of the catalogue was found" in str(found)
-        and "A wrong c0, H_bias or lambda_s in" in str(found)
+        and "A wrong c0, H_bias, N_m, A_m, lambda_s or l_rod in" in str(found)
     )
     assert not found.effects and not found.groups and found.repaired is None
     assert {"linear_strain", "mean_field", "reversible_magnetization"} <= set(found.absorbed)

@@ -647,7 +647,8 @@ def test_lambda_s_freed_with_a_prior_comes_back_and_the_valley_is_told(recording
     )
     stroke, resistance = got.estimate(name), got.estimate("coil.R_eddy")
     assert got.converged and got.chi2_per_sample < 1.1
-    assert abs(stroke.value - true) < 3 * stroke.stderr < 0.1 * true
+    # no less than the prior's; widened as all errors are, and by what the floor of the density does
+    assert abs(stroke.value - true) < 3 * stroke.stderr and 0.02 < stroke.stderr / true < 0.04
     assert abs(resistance.value - 62) < 3 * resistance.stderr and resistance.stderr > 0.4
     assert "a valley" in got.message and "lambda_s" in got.message
 

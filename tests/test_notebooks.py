@@ -1,6 +1,7 @@
 """Every notebook runs as the script it is; long ones in the long run. What is stored beside the sources belongs to them."""
 
 import ast
+import importlib.util
 import json
 import os
 import re
@@ -35,6 +36,17 @@ def test_it_runs(source, tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@EACH
+def test_what_it_imports_is_there(source):
+    """Also of the long ones, which few runs reach."""
+    for node in ast.walk(ast.parse(source.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("magjax", "fitting"):
+            module = importlib.import_module(node.module)
+            for name in node.names:
+                found = getattr(module, name.name, None) or importlib.util.find_spec(f"{node.module}.{name.name}")
+                assert found is not None, f"from {node.module} import {name.name}"
 
 
 @EACH

@@ -39,7 +39,7 @@ def folders(tmp_path_factory, truth):
         (folder / "check_aside.csv").write_text("never read")
     (root / "broken").mkdir()
     text = (root / "rod0" / "rec_010.csv").read_text().splitlines()
-    text[700] = text[700].split(",")[0] + ",nan,nan"
+    text[200:900] = [row.split(",")[0] + ",nan,nan" for row in text[200:900]]
     (root / "broken" / "rec_010.csv").write_text("\n".join(text) + "\n")
     (root / "empty").mkdir()
     (root / "notes.txt").write_text("no folder")
