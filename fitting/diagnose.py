@@ -57,6 +57,7 @@ VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
 COARSE = 0.5  # of a misfit, that a finer density may leave where the first one was too coarse
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
+GROSS = 0.1  # of its range, by which a check recording is missed that may be wrong itself
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 UNSEEN_TEXT = "Check recordings are missed, times their noise: {}; about as the fit expects, for they switch cells that no recording did."
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
@@ -139,7 +140,8 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     if not max(ratios, default=0.0) > MISSED:
         return _with_unseen_cells(found)
     worst = int(np.argmax(ratios))
-    if why := mended_by((found.repaired or found.base).actuator, check[worst], task.bench):
+    gross = found.check[worst]["rms_after"] > GROSS * np.ptp(check[worst].channels[task.bench.output])
+    if gross and (why := mended_by((found.repaired or found.base).actuator, check[worst], task.bench)):
         name = check[worst].origin.get("file", check[worst].name).rsplit("/", 1)[-1]
         return found.noted(f"The check recording {name} contradicts the others: {why}; correct it or leave it out.")
     missed, left = check[worst], [c for k, c in enumerate(check) if k != worst]
