@@ -18,7 +18,7 @@ from magjax.effects.learned_term import PAD, LearnedTerm
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
-from .adjoint import as_lines
+from .adjoint import SIGNALS, as_lines
 from .columns import marching, trajectory
 from .model import whitened
 from .screen import Projector
@@ -27,6 +27,7 @@ ONE = 48  # cosines of a function of one variable
 FINE = 160  # where none of these serves: of one variable of the sensor or the strain
 TWO = (10, 7)
 IN_STEP = (10, 6)  # inside the step every cosine costs in every iteration
+ADDED_TO = {"magnetostriction": "free displacement", "mechanics": "displacement", "sensor": "reading"}  # which of `SIGNALS`, at a place
 LENGTHS = (0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.008)  # of the range, over which a function bends
 FINER_GAIN = 5.0  # of evidence, that more cosines must bring
 KNEE = 0.1  # of the largest rate, below which a rate counts linearly
@@ -190,7 +191,7 @@ class Tangents:
                 coarse = [rows.signals.shape[3] for rows in self.rows]
                 lines = [rows.of_drive(w[:, :, :: w.shape[2] // n]) for rows, w, n in zip(self.rows, waves, coarse, strict=True)]
             else:
-                at = 3 + ("magnetostriction", "mechanics", "sensor").index(term.place)
+                at = SIGNALS.index(ADDED_TO[term.place])
                 if term.place == "mechanics":
                     waves = [
                         np.asarray(_moved(part, self.actuator, _filled(w, len(part.index))))[:, : w.shape[1]]

@@ -1,5 +1,7 @@
 """The screening's first-order columns against derivatives of the whole chain."""
 
+import dataclasses
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -10,8 +12,9 @@ import pytest
 import magjax.effects as effects
 from fitting.demo import record
 from fitting.model import predicted_lines, whitened
+from fitting.nonparametric import Tangents, null_term
 from fitting.screen import applicable, columns, shape_grid
-from fitting.setup import Choices, build_problem, free_parameters, spectra_of
+from fitting.setup import START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of
 from magjax.bench import load_bench
 
 SMALL = Choices(fine=128, coarse=90, knots=(6, 5), level=24, rest="negative")
@@ -70,3 +73,34 @@ def test_are_those_of_the_whole_chain(recordings, kinds, monkeypatch):
         assert np.linalg.norm(whole) > 0
         near = 0.1 if kind is effects.AmplifierClipping else 1e-6  # all of the change of the drive, carried on to first order
         assert np.linalg.norm(column - whole) < near * np.linalg.norm(whole), kind.name
+
+
+TERMS = {
+    "source": ("current",), "coil": ("flux_rate",), "magnetostriction": ("field",), "mechanics": ("displacement",), "sensor": ("reading",),
+}  # fmt: skip
+OFTEN = ("magnetostriction", "sensor")
+
+
+@pytest.fixture(scope="module")
+def tangents(recordings):
+    bench = load_bench("aa-050h")
+    actuator, finer = bench.actuator(), dataclasses.replace(SMALL, fine=2 * SMALL.coarse)
+    problem, z = build_problem(spectra_of(recordings, bench, SMALL.harmonics), actuator, bench, free_parameters(bench, actuator, ()), finer, None)
+    return Tangents(SimpleNamespace(problem=problem, refined=SimpleNamespace(z=z, weights=np.array(START_WEIGHTS[: len(problem.penalties)]))))
+
+
+@pytest.mark.parametrize("place", [p if p in OFTEN else pytest.param(p, marks=pytest.mark.long) for p in TERMS])
+def test_columns_of_a_learned_term_are_those_of_the_whole_chain(tangents, place):
+    """The places behind the hysteresis had been given the columns of the signal before each, and an unknown its block."""
+    problem = tangents.problem
+    term = null_term(place, TERMS[place], tangents.signals, tangents.actuator, (4,))
+    predictor = problem.predictors[0 if place in ("source", "coil") else 1]
+    target = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
+
+    def lines(size):
+        first = eqx.tree_at(lambda t: t.coefficients[1], term, size)
+        return predicted_lines(predictor, tangents.actuator.with_effect(first))
+
+    whole = np.asarray(whitened(jax.jit(lambda x: jax.jvp(lines, (0.0,), (x,))[1])(1.0), target))
+    found = tangents.columns(term)[:, 1]
+    assert np.linalg.norm(whole) > 0 and np.linalg.norm(found - whole) < 0.02 * np.linalg.norm(whole)
