@@ -140,8 +140,7 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     if not max(ratios, default=0.0) > MISSED:
         return _with_unseen_cells(found)
     worst = int(np.argmax(ratios))
-    gross = found.check[worst]["rms_after"] > GROSS * np.ptp(check[worst].channels[task.bench.output])
-    if gross and (why := mended_by((found.repaired or found.base).actuator, check[worst], task.bench)):
+    if why := _contradiction(found, found.check[worst], check[worst], task.bench):
         name = check[worst].origin.get("file", check[worst].name).rsplit("/", 1)[-1]
         return found.noted(f"The check recording {name} contradicts the others: {why}; correct it or leave it out.")
     missed, left = check[worst], [c for k, c in enumerate(check) if k != worst]
@@ -162,6 +161,13 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     row = {**found.check[worst], "rms_after": again.repaired.recordings[-1].residual_rms, "joined": True}
     again = dataclasses.replace(again, check=(*again.check[:worst], row, *again.check[worst:]))
     return again.noted(f"Without it among the recordings {told}; it joined them.")
+
+
+def _contradiction(found, row, recording, bench) -> str | None:
+    """What is wrong with a check recording that is missed grossly, in words; None where no one number mends it."""
+    if not row["rms_after"] > GROSS * np.ptp(recording.channels[bench.output]):
+        return None
+    return mended_by((found.repaired or found.base).actuator, recording, bench)
 
 
 def _with_unseen_cells(found) -> Diagnosis:
