@@ -140,11 +140,10 @@ def _with_missed_check(task, found, check) -> Diagnosis:
     if not max(ratios, default=0.0) > MISSED:
         return _with_unseen_cells(found)
     worst = int(np.argmax(ratios))
-    if why := _contradiction(found, found.check[worst], check[worst], task.bench):
-        name = check[worst].origin.get("file", check[worst].name).rsplit("/", 1)[-1]
-        return found.noted(f"The check recording {name} contradicts the others: {why}; correct it or leave it out.")
     missed, left = check[worst], [c for k, c in enumerate(check) if k != worst]
     name = missed.origin.get("file", missed.name).rsplit("/", 1)[-1]
+    if why := _contradiction(found, found.check[worst], missed, task.bench):
+        return found.noted(f"The check recording {name} contradicts the others: {why}; correct it or leave it out.")
     told = f"{name} is missed by {ratios[worst]:.0f} times its noise, though the fit meets its own"
     if not left:
         return found.noted(f"{told}: the recordings do not reach what it shows; give it as one of them, and others to check.")
@@ -215,8 +214,11 @@ def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zer
 
 
 def _spoilt(task, plain):
-    """What speaks against the recordings; None where nothing does, or no time is left to ask."""
+    """What speaks against the recordings; None where nothing does, where a sign is swapped, which is told by itself, or no time is
+    left to ask."""
     with contextlib.suppress(Late):
+        if wrong_bench(plain):
+            return None
         return spoilt(task.sparing, plain)
     return None
 

@@ -122,7 +122,7 @@ def test_milliseconds_in_all_files_are_named():
 
 def test_a_spoilt_recording_ends_the_diagnosis_before_any_search(monkeypatch):
     """Far from the noise; nearer by, where no effect was found."""
-    base = dataclasses.make_dataclass("Base", ["chi2_per_sample"])
+    base = dataclasses.make_dataclass("Base", ["chi2_per_sample"], namespace={"spectra": (), "recordings": ()})
     searched = []
     monkeypatch.setattr(module, "spoilt", lambda task, plain: Spoilt("it is wrong", True))
     monkeypatch.setattr(module, "_explained", lambda *a: searched.append(1) or Diagnosis("unknown_at", "Something is missing."))
@@ -135,6 +135,8 @@ def test_a_spoilt_recording_ends_the_diagnosis_before_any_search(monkeypatch):
     monkeypatch.setattr(module, "spoilt", lambda task, plain: Spoilt("look at it", False))
     found = module._examined(task, task, [], [])
     assert found.verdict == "unknown_at" and found.message.endswith("look at it.")
+    monkeypatch.setattr(module, "wrong_bench", lambda plain: "a sign is swapped")  # which is told by itself
+    assert module._examined(task, task, [], []).message == "Something is missing."
 
 
 def test_a_check_recording_that_contradicts_is_named(monkeypatch):
