@@ -17,13 +17,13 @@ from magjax.recording import Recording
 
 module = importlib.import_module("fitting.diagnose")  # not the function
 BENCH = load_bench("aa-050h")
-TRUTH = concealed_actuator(BENCH)
+TRUTH = BENCH.actuator()  # of few relays: what is foretold from it takes little time
 DRIVES = ((10, 0.8, 0.1), (25, 0.5, -0.2), (80, 0.6, 0.1), (120, 0.5, -0.1), (230, 0.5, -0.2))
 
 
-def recorded(drives=DRIVES):
+def recorded(drives=DRIVES, truth=TRUTH):
     rng = np.random.default_rng(5)
-    return [record(TRUTH, f, amplitude, offset, rng, f"{f} Hz") for f, amplitude, offset in drives]
+    return [record(truth, f, amplitude, offset, rng, f"{f} Hz") for f, amplitude, offset in drives]
 
 
 def changed(row, reading=None, current=None, clock=1.0):
@@ -45,7 +45,7 @@ SPOILT = {
 }
 
 
-FEW = ("gain", "current", "time")
+FEW = ("gain", "current")
 
 
 @pytest.mark.parametrize("kind", [k if k in FEW else pytest.param(k, marks=pytest.mark.long) for k in SPOILT])
@@ -98,7 +98,7 @@ def test_it_is_left_out_before_it_is_named(monkeypatch, misses, left, found):
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["gain", "zero", "delay", "current", "time"])
 def test_a_spoilt_recording_is_named_and_no_physics(kind):
-    rows = recorded()
+    rows = recorded(truth=concealed_actuator(BENCH))
     how, words = SPOILT[kind]
     rows[2] = changed(rows[2], **how)
     found = suspected(rows)
@@ -107,16 +107,16 @@ def test_a_spoilt_recording_is_named_and_no_physics(kind):
 
 @pytest.mark.long
 def test_one_recording_that_bends_is_pointed_at_and_no_more():
-    rows = recorded()
+    rows = recorded(truth=concealed_actuator(BENCH))
     rows[2] = changed(rows[2], reading=lambda y: y + 0.5 * (y - y.mean()) ** 2 / np.ptp(y))
     found = suspected(rows)
     assert not found.certain and found.told.startswith("Without 80 Hz")
-    assert suspected(recorded()) is None
+    assert suspected(recorded(truth=concealed_actuator(BENCH))) is None
 
 
 @pytest.mark.long
 def test_milliseconds_in_all_files_are_named():
-    found = suspected([changed(r, clock=1e3) for r in recorded()])
+    found = suspected([changed(r, clock=1e3) for r in recorded(truth=concealed_actuator(BENCH))])
     assert found.certain and "name the column time_ms" in found.told
 
 
@@ -142,7 +142,7 @@ def test_a_spoilt_recording_ends_the_diagnosis_before_any_search(monkeypatch):
 def test_a_check_recording_that_contradicts_is_named(monkeypatch):
     row = record(TRUTH, 80, 0.5, 0.05, np.random.default_rng(3), "80 Hz")
     fitted = dataclasses.make_dataclass("Fitted", ["actuator", "chi2_per_sample"])(TRUTH, 0.9)
-    rows = ({"file": "80 Hz", "rms_before": 5e-6, "rms_after": 5e-6, "noise_rms": 5e-8, "beyond_plane": 0.0},)
+    rows = ({"file": "80 Hz", "rms_before": 5e-5, "rms_after": 5e-5, "noise_rms": 5e-8, "beyond_plane": 0.0},)
     found = Diagnosis("nothing_missing", "All is well.", base=fitted, check=rows)
     swapped = changed(row, reading=lambda y: -y)
     again = module._with_missed_check(Task((row,), BENCH), found, [swapped])
