@@ -17,7 +17,7 @@ from .attribute import (
     settled,
     to_the_end,
 )  # fmt: skip
-from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, hats_of_step
+from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, hats_of_step, on
 from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .screen import screened
 from .together import together
@@ -88,8 +88,9 @@ def refitted(task, current, best, good, excess, any_rest: bool = True, any_densi
         if against[0] < against[1] + margin:
             found = other.choices
     ahead, left, highest = best.result, best.result.chi2_per_sample, max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
-    if any_density and finer_hats(chosen) and FINER_FROM[0] < left < highest:
-        found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra, refine=highest).choices
+    if any_density and (finer_hats(chosen) or chosen.stiffness is not None) and FINER_FROM[0] < left < highest:
+        bare = on(found)  # steps of the density that were found beside the misfit may be some of it
+        found = task.fit(best.result.actuator, choices=bare, spectra=best.result.spectra, refine=highest).choices
     elif any_density and left >= highest:
         for choices in hats_of_step(found, task.bench, 2):
             last = task.fit_on(best.result, best.result.actuator, choices=choices)

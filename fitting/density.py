@@ -19,6 +19,7 @@ from magjax.errors import ConfigurationError
 R_EXPONENT = 1.6
 TAIL = 0.5
 RIDGE = 0.3  # beside second differences
+SAME_PLANE = 0.02  # of a plane, by which its ends may move before what was found of its density is of another
 AT_ONCE = 100  # unknowns whose planes are in memory side by side
 
 
@@ -204,6 +205,29 @@ def hat_basis(
     flat = np.ones(cells.shape[1])
     flat[main:] = 0.05
     return DensityBasis(low - step, high + step, size, cells, tuple(penalties), total, flat, knots_s, knots_r)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stiffness:
+    """How much each difference of a density weighs, where not all of a family weigh the same: `weights` of the families times
+    `factors` of their rows, of a density with `knots` between the fields `low` and `high`."""
+
+    weights: np.ndarray
+    factors: tuple[np.ndarray, ...]
+    knots: tuple[int, int]
+    low: float
+    high: float
+
+    def fits(self, basis: DensityBasis) -> bool:
+        """Whether it is of this density, on nearly this plane."""
+        near = abs(basis.low - self.low) + abs(basis.high - self.high) < SAME_PLANE * (self.high - self.low)
+        rows = tuple(D.shape[0] for D in basis.penalties)
+        return near and self.knots == (basis.knots_s, basis.knots_r) and rows == tuple(len(f) for f in self.factors)
+
+    def of(self, penalties) -> tuple[csr_array, ...]:
+        """The differences times the roots of their weights."""
+        roots = [np.sqrt(w * f) for w, f in zip(self.weights, self.factors, strict=True)]
+        return tuple(csr_array(D.multiply(root[:, None])) for root, D in zip(roots, penalties, strict=True))
 
 
 def _continuation(low, high, once_knots, s_knots, r_knots, number, main, scale, unknowns):

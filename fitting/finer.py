@@ -15,6 +15,8 @@ FINER_MATERIAL = (  # where the field is known loops are steep, and cells too wi
 )
 FINER_FROM = (1.05, 1.5, 2.0)  # chi2/N from which each step is tried,
 FINER_TAKES = (0.7, 0.5, 0.5)  # and the share of the excess that it may leave
+STEPS_FROM = 1.05  # chi2/N from which steps of the density are allowed for on the hats of the second step,
+STEPS_ON = (36, 24)  # and the hats from which on they are: on coarser ones they have no room
 CELLS_MEET = 1.25  # chi2/N that cells must reach too: they take up physics, but not all of it
 REFINE_BELOW = 8.0  # chi2/N above which it is physics that is missing
 FINEST_BELOW = 30.0  # the same of the finest hats
@@ -22,10 +24,15 @@ REFINE_BESIDE = 30.0  # the same beside an effect: what it leaves may well be th
 REFINE_MATERIAL = 100.0  # instead of 8 where the field is known: steep loops ask for finer hats from far off
 
 
+def on(choices, **density):
+    """The choices with another density, of which nothing is known yet."""
+    return dataclasses.replace(choices, stiffness=None, **density)
+
+
 def finer_than(choices, bench) -> tuple:
     """The densities that may be tried after that of `choices`, those of one step side by side; () for steps that it has taken."""
     steps = FINER if bench.drive == "current" else FINER_MATERIAL
-    steps = tuple(tuple(dataclasses.replace(choices, **row) for row in step) for step in steps)
+    steps = tuple(tuple(on(choices, **row) for row in step) for step in steps)
     if choices.knots is None:
         return ((),) * len(steps)
     taken = [any(row.knots is not None and row.knots <= choices.knots for row in step) for step in steps]
@@ -37,6 +44,11 @@ def hats_of_step(choices, bench, step: int) -> tuple:
     return tuple(row for row in finer_than(choices, bench)[step] if row.knots is not None)
 
 
+def has_steps(choices, bench) -> bool:
+    """Whether a fit of this density may give it steps (`steps.stepped`)."""
+    return bench.drive == "current" and choices.knots is not None and choices.knots >= STEPS_ON
+
+
 def finest(choices) -> bool:
     """Whether no finer hats are tried than those of `choices`."""
     return choices.knots is not None and choices.knots >= FINER[-1][0]["knots"]
@@ -44,10 +56,10 @@ def finest(choices) -> bool:
 
 def cells_beside(choices) -> tuple:
     """Densities of a mass a cell to set beside one of hats; () where it is of cells itself."""
-    return () if choices.knots is None else tuple(dataclasses.replace(choices, **row) for row in CELLS)
+    return () if choices.knots is None else tuple(on(choices, **row) for row in CELLS)
 
 
 def finer_hats(choices) -> tuple:
     """The next finer hats; () after the finest, and where the density is of cells."""
     rows = (row for step in FINER for row in step if row["knots"] is not None and choices.knots is not None)
-    return tuple(dataclasses.replace(choices, **row) for row in rows if row["knots"] > choices.knots)[:1]
+    return tuple(on(choices, **row) for row in rows if row["knots"] > choices.knots)[:1]

@@ -11,7 +11,18 @@ import numpy as np
 from magjax.bench import load_bench
 from magjax.simulate import require_x64
 
-from .finer import CELLS_MEET, FINER_FROM, FINER_TAKES, REFINE_BELOW, REFINE_BESIDE, REFINE_MATERIAL, finer_than
+from .finer import (
+    CELLS_MEET,
+    FINER_FROM,
+    FINER_TAKES,
+    REFINE_BELOW,
+    REFINE_BESIDE,
+    REFINE_MATERIAL,
+    STEPS_FROM,
+    finer_than,
+    has_steps,
+    hats_of_step,
+)
 from .joint import compiled, data_residual, prior_matrix, solve
 from .memories import apart, best_memory, rests_of, settled
 from .outcome import (
@@ -28,7 +39,8 @@ from .outcome import (
     valleys,
 )
 from .result import FitResult, Quoted
-from .setup import EDDY_EFFECT, START_WEIGHTS, Choices, build_problem, free_parameters, spectra_of, with_held_masses
+from .setup import EDDY_EFFECT, Choices, build_problem, free_parameters, spectra_of, with_held_masses
+from .steps import stepped
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
@@ -106,6 +118,11 @@ def _changes_scale(bench, names, start) -> bool:
     return bench.drive == "field" and EDDY_EFFECT in names and EDDY_EFFECT not in start.problem.layout.names
 
 
+def _same_weights(problem, other) -> bool:
+    """Whether roughness weights of the one serve the other."""
+    return problem.layout.density_unknowns == other.layout.density_unknowns and problem.stiffness is other.stiffness
+
+
 def _density(start):
     """Density unknowns and bottom of a fit, None for None."""
     return None if start is None else start.solution.z[: start.problem.layout.density_unknowns + 1]
@@ -123,8 +140,8 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
 
         def one(say):
             known, z = build_problem(spectra, actuator, bench, names, tried, _density(start)) if posed is None else posed
-            same = start is not None and start.problem.layout.density_unknowns == known.layout.density_unknowns
-            weights = start.solution.weights if same else START_WEIGHTS[: len(known.penalties)]
+            same = start is not None and _same_weights(start.problem, known)
+            weights = start.solution.weights if same else np.asarray(known.target.weights)
             found = solve(
                 known,
                 z,
@@ -161,34 +178,46 @@ def _with_turning(z, solution, actuator, bench, names, choices, spectra, report,
 def _refine_density(problem, solution, actuator, bench, names, choices, spectra, report, highest):
     """A finer density where chi2 stays above the noise, chi2/N below `highest`, and it lowers it clearly."""
     count = problem.data_count
-    for densities, least, takes in zip(finer_than(choices, bench), FINER_FROM, FINER_TAKES, strict=True):
-        if not densities or not least < solution.chi2 / count < highest:
-            continue
-        # a finer density must take its share of the excess, and five standard deviations
+
+    def best(densities, takes, problem, solution, choices):
+        """Of those that take their share of the excess, and five standard deviations, the one that leaves least."""
         target = min(0.95 * count + takes * max(solution.chi2 - 0.95 * count, 0.0), solution.chi2 - 25)
         targets = [min(target, CELLS_MEET * count) if finer.knots is None else target for finer in densities]
 
-        def tried(finer, target, known=problem, before=solution):
-            return lambda say: _on_density(known, before, actuator, bench, names, finer, spectra, target, say)
+        def tried(finer, target):
+            return lambda say: _on_density(problem, solution, actuator, bench, names, finer, spectra, target, say)
 
         try:
             trials = together([tried(*pair) for pair in zip(densities, targets, strict=True)], report)
         except KeyboardInterrupt:
             return problem, dataclasses.replace(solution, interrupted=True), choices
         met = [trial for trial, target in zip(trials, targets, strict=True) if trial[1].chi2 < target]
-        if met:
-            problem, solution, choices = min(met, key=lambda trial: trial[1].chi2)
+        return min(met, key=lambda trial: trial[1].chi2, default=(problem, solution, choices))
+
+    for densities, least, takes in zip(finer_than(choices, bench), FINER_FROM, FINER_TAKES, strict=True):
+        if densities and least < solution.chi2 / count < highest and not solution.interrupted:
+            problem, solution, choices = best(densities, takes, problem, solution, choices)
+    little = STEPS_FROM < solution.chi2 / count < min(FINER_FROM[1], highest) and not solution.interrupted
+    hats = hats_of_step(choices, bench, 1) or (choices,)
+    if little and choices.stiffness is None and has_steps(hats[0], bench):
+        problem, solution, choices = best(hats, FINER_TAKES[1], problem, solution, choices)
     return problem, solution, choices
 
 
 def _on_density(problem, solution, actuator, bench, names, finer, spectra, target, report):
-    """The fit with a finer density, from where that with the coarser one ended: (problem, solution, its choices)."""
+    """The fit with a finer density, from where that with the coarser one ended, with steps where these take what it leaves:
+    (problem, solution, its choices)."""
     found, z = _resample(problem, solution, spectra, actuator, bench, names, finer)
     z = _with_parameters(found, z, problem, solution)
-    weights = np.asarray(found.target.weights) if finer.knots is None else solution.weights  # of another basis
-    trial = solve(
-        found, z, weights, max_jacobians=finer.max_jacobians, target=target, progress=lambda k, c: report("finer density", k, c)
-    )
+    other = finer.knots is None or problem.stiffness is not None  # of another basis
+    weights = np.asarray(found.target.weights) if other else solution.weights
+    say = functools.partial(report, "finer density")
+    steps = has_steps(finer, bench)
+    useful = max(target, solution.chi2) if steps else target
+    trial = solve(found, z, weights, max_jacobians=finer.max_jacobians, target=useful, progress=say)
+    if steps and not trial.interrupted and trial.chi2 < useful:
+        found, trial = stepped(found, trial, say)
+        finer = dataclasses.replace(finer, stiffness=found.stiffness)
     if trial.interrupted:
         raise KeyboardInterrupt
     return found, trial, finer

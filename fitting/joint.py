@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import structural_rank
 
 from magjax.programs import kept
 
-from .density import DensityBasis
+from .density import DensityBasis, Stiffness
 from .model import Layout, Predictor, Target, whitened
 from .passes import Passes
 from .solver import SteppedLevenbergMarquardt, cost_of
@@ -47,6 +47,7 @@ class Problem:
     spectra: tuple
     basis: DensityBasis
     quasistatic: bool = False  # the time axis is made up: nothing that depends on a rate may be claimed
+    stiffness: Stiffness | None = None  # of each difference by itself, where the density has steps
 
     @property
     def noise_rms(self) -> float:
@@ -59,10 +60,10 @@ class Problem:
         finite = np.isfinite(np.asarray(self.target.deviations))
         return int(2 * finite.sum() - finite[:, 0].sum())
 
-    @property
+    @functools.cached_property
     def penalties(self) -> tuple:
-        """Roughness of the density: a sparse matrix of second differences a family."""
-        return self.basis.penalties
+        """Roughness of the density: a sparse matrix of second differences a family, each row weighed where they have steps."""
+        return self.basis.penalties if self.stiffness is None else self.stiffness.of(self.basis.penalties)
 
     @functools.cached_property
     def passes(self) -> Passes:
@@ -174,6 +175,7 @@ def solve(
     be reached to be of use; once four times the promised fall cannot lead there, or the pace, the iteration ends.
     """
     layout, count = problem.layout, problem.data_count
+    evidence = evidence and problem.stiffness is None
     solver = SteppedLevenbergMarquardt(layout.bounds)
     z, weights = np.asarray(z, float), np.asarray(weights, float)
     posed = {"jacobian": lambda z: data_jacobian(problem, z), "prior": prior_matrix(problem, weights)}

@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from magjax.errors import ConfigurationError, RecordingError
@@ -9,7 +11,7 @@ from magjax.extrema import nesting
 from magjax.param import in_numpy
 from magjax.recording import NO_ANSWER, follows_nothing
 
-from .density import cell_basis, hat_basis, held_basis
+from .density import Stiffness, cell_basis, hat_basis, held_basis
 from .joint import Problem
 from .model import Layout, Predictor, Target, make_start_actuator, on_device
 from .spectra import HARMONICS, gain_rows, line_deviations, reduce_recording, with_noise
@@ -42,6 +44,7 @@ class Choices:
     only: tuple[str, ...] = ()  # the effects that it does ask for, where these are named
     rest: str = "auto"  # start memory: "negative", "demagnetized" about the drive's zero, "virgin": about no field, "positive", or tried in turn
     touching: bool = False  # start from loops whose M may turn its sign wherever the strain comes near zero
+    stiffness: Stiffness | None = None  # of a density with steps; None: one weight a family of differences, by evidence
 
 
 def spectra_of(recordings, bench, harmonics: int = HARMONICS):
@@ -180,7 +183,10 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     template = actuator if held else make_start_actuator(actuator, basis, rest)
     if isinstance(bench.start, tuple) and not held:
         template = template.remembering(bench.start)
-    problem = Problem(layout, template, predictors, target, tuple(spectra), basis, bench.quasistatic)
+    stiffness = choices.stiffness if choices.stiffness is not None and choices.stiffness.fits(basis) else None
+    if stiffness is not None:
+        target = eqx.tree_at(lambda t: t.weights, target, jnp.ones(len(basis.penalties)))
+    problem = Problem(layout, template, predictors, target, tuple(spectra), basis, bench.quasistatic, stiffness)
     return problem, np.concatenate([start, [layout.coordinate(n, v) for n, v in zip(names, values, strict=True)], np.zeros(memories)])
 
 

@@ -74,9 +74,9 @@ def test_silent_where_nothing_is_missing(bench):
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        pytest.param(("mean_field", "linear_strain"), "absorbed", id="what the density hides"),
+        pytest.param(("mean_field", "linear_strain"), "absorbed", id="what the density hides", marks=pytest.mark.long),
         pytest.param(("mean_field", "sensor_lag"), "nothing_missing", id="one that would show", marks=pytest.mark.long),
-        pytest.param(("mains_hum",), "nothing_missing", id="one between the harmonics", marks=pytest.mark.long),
+        pytest.param(("mains_hum",), "nothing_missing", id="one between the harmonics"),
     ],
 )
 def test_effects_that_are_asked_for_alone(bench, asked, said):

@@ -43,6 +43,7 @@ def demagnetize(box, amplitude=0.9, offset=0.0):
     play(box, amplitude, offset, DECAY_PERIODS, DECAY, DECAY_WIDTH, 50.0 * DECAY_WIDTH)
 
 
+@pytest.mark.long
 def test_two_runs_are_one_long_simulation(bench):
     box = device(bench)
     played = [play(box, 0.85, 0.0)[-WIDTH:], play(box, 0.3, 0.2)[-WIDTH:], play(box, 0.2, -0.3)[-WIDTH:]]
