@@ -20,6 +20,7 @@ from .attribute import (
 from .finer import FINER_FROM, REFINE_BESIDE, finer_hats, hats_of_step, on
 from .memories import REST_SETTLED, against_memory, memory_is_told, rests_of
 from .screen import screened
+from .setup import Choices
 from .together import together
 from .trials import IMITATES
 from .verdict import FAR_FROM_NOISE, HALF
@@ -75,7 +76,7 @@ def refitted(task, current, best, good, excess, any_rest: bool = True, any_densi
     task with what was chosen.
 
     Start memories that serve as well foretell other mean levels: the one that is tried first stands unless another is
-    better by MIN_DROP.
+    better by MIN_DROP. A density with steps is looked for anew, from the first hats on.
     """
     found = chosen = task.choices
     free = dataclasses.replace(chosen, rest="auto")
@@ -88,9 +89,11 @@ def refitted(task, current, best, good, excess, any_rest: bool = True, any_densi
         if against[0] < against[1] + margin:
             found = other.choices
     ahead, left, highest = best.result, best.result.chi2_per_sample, max(REFINE_BESIDE, LITTLE_LEFT * current.chi2_per_sample)
-    if any_density and (finer_hats(chosen) or chosen.stiffness is not None) and FINER_FROM[0] < left < highest:
-        bare = on(found)  # steps of the density that were found beside the misfit may be some of it
+    if chosen.stiffness is not None and left < highest:  # steps that were found under the misfit may have taken some of it
+        bare = on(found, knots=Choices().knots, cells=None)
         found = task.fit(best.result.actuator, choices=bare, spectra=best.result.spectra, refine=highest).choices
+    elif any_density and finer_hats(chosen) and FINER_FROM[0] < left < highest:
+        found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra, refine=highest).choices
     elif any_density and left >= highest:
         for choices in hats_of_step(found, task.bench, 2):
             last = task.fit_on(best.result, best.result.actuator, choices=choices)
@@ -112,7 +115,8 @@ def refitted(task, current, best, good, excess, any_rest: bool = True, any_densi
 
     again = [t for t in together([anew(t) for t in near], task.progress) if t.physical]
     ended = min(again, key=lambda t: t.bic_change, default=best)
-    if not again or chi2_of(ended.result) > chi2_of(best.result) + MIN_DROP:
+    met = chosen.stiffness is not None and ended.result.chi2_per_sample < FINER_FROM[0]  # without the freedom of those steps
+    if not again or (chi2_of(ended.result) > chi2_of(best.result) + MIN_DROP and not met):
         return best, good, before
     far = [t for t in good if t.name not in {a.name for a in again}]  # no rivals alone, but they may be beside a later effect
     return ended, [*again, *far], task

@@ -213,7 +213,7 @@ def _on_density(problem, solution, actuator, bench, names, finer, spectra, targe
     weights = np.asarray(found.target.weights) if other else solution.weights
     say = functools.partial(report, "finer density")
     steps = has_steps(finer, bench)
-    useful = max(target, solution.chi2) if steps else target
+    useful = solution.chi2 + max(solution.chi2 - problem.data_count, 0.0) if steps else target  # steps may yet take it
     trial = solve(found, z, weights, max_jacobians=finer.max_jacobians, target=useful, progress=say)
     if steps and not trial.interrupted and trial.chi2 < useful:
         found, trial = stepped(found, trial, say)
