@@ -209,8 +209,8 @@ def _on_density(problem, solution, actuator, bench, names, finer, spectra, targe
     (problem, solution, its choices)."""
     found, z = _resample(problem, solution, spectra, actuator, bench, names, finer)
     z = _with_parameters(found, z, problem, solution)
-    other = finer.knots is None or problem.stiffness is not None  # of another basis
-    weights = np.asarray(found.target.weights) if other else solution.weights
+    of_families = solution.weights if problem.stiffness is None else problem.stiffness.weights
+    weights = np.asarray(found.target.weights) if finer.knots is None else of_families  # of another basis
     say = functools.partial(report, "finer density")
     steps = has_steps(finer, bench)
     useful = solution.chi2 + max(solution.chi2 - problem.data_count, 0.0) if steps else target  # steps may yet take it

@@ -5,7 +5,7 @@ rough, or smooths the steps away and leaves a misfit that looks like physics. Di
 a weight each, (nu + 1) / (nu + weight x difference^2) times that of the family, found by solving again with the weights of the
 last solution (iteratively reweighted least squares: Charbonnier, Blanc-Feraud, Aubert and Barlaud, IEEE Trans. Image Processing
 6, 298, 1997, call it edge-preserving regularization).
-What physics leaves, no density takes that way: on smooth benches chi2 hardly moves.
+Of what physics leaves that takes little: 2 to 8 % of what is above the noise on smooth benches, most of a random density's.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from .density import Stiffness
 from .joint import solve
 
 NU = 0.3  # degrees of freedom of Student's law: 0.1 to 1 foretell alike, 3 worse
-ROUNDS, JACOBIANS = 4, 5  # of the weights, and within each; twice as many change little
+ROUNDS, JACOBIANS, AT_LAST = 4, 5, 30  # of the weights, within each, and of a last one that has not settled; more rounds change little
 GAINS = 0.1  # share of what is above the noise that the first round must take: what physics leaves stays
 SETTLED = 2e-3  # share of chi2 that a round must move it by, to be followed by another
 
@@ -26,17 +26,23 @@ def stepped(problem, solution, progress=None):
 
     Returns (problem, solution); those that were given where the misfit is none that steps of the density leave.
     """
-    basis, count = problem.basis, problem.data_count
+    basis, count, n = problem.basis, problem.data_count, problem.layout.density_unknowns
     weights = solution.weights if problem.stiffness is None else problem.stiffness.weights
     ones, begun, first = np.ones(len(weights)), problem, solution
+
+    def gone_on(most):
+        """The solution from where it stands, with what it took so far."""
+        found = solve(problem, solution.z, ones, max_jacobians=most, progress=progress)
+        spent = {"jacobians": solution.jacobians + found.jacobians, "seconds": solution.seconds + found.seconds}
+        return dataclasses.replace(found, **spent)
+
     for _ in range(ROUNDS):
-        differences = [D @ solution.z[: problem.layout.density_unknowns] for D in basis.penalties]
-        factors = tuple((NU + 1) / (NU + w * d**2) for w, d in zip(weights, differences, strict=True))
+        factors = tuple((NU + 1) / (NU + w * (D @ solution.z[:n]) ** 2) for w, D in zip(weights, basis.penalties, strict=True))
         stiffness = Stiffness(weights, factors, (basis.knots_s, basis.knots_r), basis.low, basis.high)
         problem = dataclasses.replace(problem, stiffness=stiffness).with_weights(ones)
-        before, solution = solution, solve(problem, solution.z, ones, max_jacobians=JACOBIANS, progress=progress)
+        before, solution = solution, gone_on(JACOBIANS)
         if solution.chi2 - count > (1 - GAINS) * max(first.chi2 - count, 0.0):
             return begun, dataclasses.replace(first, interrupted=first.interrupted or solution.interrupted)
         if solution.interrupted or abs(solution.chi2 - before.chi2) < SETTLED * before.chi2:
             break
-    return problem, solution
+    return problem, solution if solution.converged or solution.interrupted else gone_on(AT_LAST)

@@ -13,6 +13,7 @@ import fitting.search
 import fitting.trials
 import fitting.verdict
 from fitting.attribute import Trial, _physical, chi2_of, confidence, excess_of, family, leaders, rivals_of, tie_of
+from fitting.density import Stiffness
 from fitting.diagnosis import Evidence
 from fitting.exchange import both_found
 from fitting.record_level import RecordEffect
@@ -345,6 +346,27 @@ def test_a_finer_density_is_tried_beside_what_takes_nearly_all(monkeypatch, befo
     task = Task((), SimpleNamespace(start="negative"), Choices(rest="negative"))
     fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=before), best, [best], 1.0, any_rest=False)
     assert limits == [pytest.approx(asked)]
+
+
+@pytest.mark.parametrize(("again", "taken"), [(0.77, True), (1.3, False)], ids=["meets the noise", "does not"])
+def test_steps_of_a_density_are_looked_for_anew_beside_an_effect(monkeypatch, again, taken):
+    """Beside a delta_e that was missing a density took steps, which were some of it: with them checks were missed by 1.3 of their noise,
+    for 1.1 without."""
+    best, begun = trial("delta_e", 0.72, base=1.0), []
+    best.result.actuator, best.result.spectra = SimpleNamespace(effects=(), effect=lambda name: CLASSES[name]()), None
+    even = SimpleNamespace(**vars(best.result) | {"chi2_per_sample": again, "choices": Choices(rest="negative")})
+
+    def fit(*a, choices, **k):
+        begun.append((choices.knots, choices.stiffness))
+        return even
+
+    monkeypatch.setattr("fitting.task.fit_or_stop", fit)
+    monkeypatch.setattr(fitting.adoption, "credited", lambda c, result, *a: dataclasses.replace(best, result=result))
+    stepped = Choices(knots=(26, 18), rest="negative", stiffness=Stiffness(np.ones(3), (), (26, 18), 0.0, 1.0))
+    task = Task((), SimpleNamespace(start="negative", drive="current"), stepped)
+    found, _, then = fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=1.0), best, [best], 1.0, any_rest=False)
+    assert begun[0] == (Choices().knots, None)
+    assert (found.result is even, then.choices.stiffness is None) == (taken, taken)
 
 
 @pytest.mark.parametrize(("ends", "promised", "taken"), [(1.35, False, True), (30.0, False, False), (1.35, True, False)])
