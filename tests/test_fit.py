@@ -247,6 +247,7 @@ def test_a_positive_parameter_stays_within_thirty_times_of_the_bench(recordings,
     assert "coil.R_eddy sits at its bound" in stuck.message
 
 
+@pytest.mark.long
 def test_a_gauge_is_told_with_what_makes_up_for_it(recordings, bench, result):
     assert result.estimate("coil.R_eddy").identified and "not identified" not in result.message
     free = fit(recordings, bench, extra=("coil.H_bias",), choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)
@@ -309,6 +310,7 @@ def test_drives_that_are_asked_for_are_predicted_by_the_programs_of_the_fit(resu
     assert (ahead - r) / 1e-4 == pytest.approx(J[..., k], abs=1e-3 * np.abs(J[..., k]).max())
 
 
+@pytest.mark.long
 def test_a_given_history_is_where_every_recording_starts(recordings, bench):
     past = dataclasses.replace(bench, start=(20000.0, 5000.0, 15000.0))
     found = fit(recordings, past, choices=dataclasses.replace(QUICK, max_jacobians=2), refine=False)

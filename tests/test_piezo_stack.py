@@ -226,6 +226,7 @@ def test_a_polarization_loop_of_a_ferroelectric_sample(tmp_path):
     assert max(r.residual_rms for r in result.recordings) < 0.02 * 0.47
 
 
+@pytest.mark.long
 def test_the_normal_matrix_is_that_of_the_weights_returned(tmp_path):
     """What a fit counts as unknowns is normal less prior: with weights that moved after the last step it fell below zero."""
 

@@ -57,6 +57,7 @@ def test_silent_and_resumed(final, runs, tmp_path):
     assert placebo(other, runs, 3, checkpoint=tmp_path / "kept") == again  # the same fit at another speed
 
 
+@pytest.mark.long
 def test_an_alarm_of_the_screening_is_fitted_and_names_nothing(final, runs, monkeypatch):
     monkeypatch.setattr(search_module, "Z_THRESHOLD", 1e-3)
     tried = []

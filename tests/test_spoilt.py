@@ -78,7 +78,7 @@ Fitted = dataclasses.make_dataclass("Fitted", ["chi2_per_sample", "recordings", 
 @pytest.mark.parametrize(
     ("misses", "left", "found"),
     [
-        ((300.0, 900.0, 800.0, 200.0, 100.0), [700.0, 0.9], True),  # the second worst it is
+        pytest.param((300.0, 900.0, 800.0, 200.0, 100.0), [700.0, 0.9], True, marks=pytest.mark.long),  # the second worst it is
         ((300.0, 900.0, 800.0, 200.0, 100.0), [700.0, 30.0], False),  # something is missing without it, too
         ((300.0, 500.0, 480.0, 400.0, 300.0), [0.9, 0.9], False),  # none stands out
         ((1.0, 1.1, 2.5, 0.9, 1.0), [0.9, 0.9], False),  # the noise is met

@@ -80,6 +80,7 @@ def test_engine_agrees_with_the_events_to_its_order():
     assert errors[1] < 0.35 * errors[0] and errors[0] < 2e-3 * plant.M_s
 
 
+@pytest.mark.long
 def test_compiled_inversion_is_the_same_walk_and_does_not_drift():
     pytest.importorskip("numba")
     from magjax.inverse.accelerated import invert_many

@@ -33,6 +33,7 @@ def test_by_address_and_by_client(cluster):
             run_job(job(works.refusing), client)
 
 
+@pytest.mark.long
 def test_a_killed_worker_is_replaced(cluster, tmp_path):
     outcome = run_job(job(works.fatal_once, folder=str(tmp_path)), f"dask:{cluster.scheduler_address}", checkpoint=tmp_path / "job")
     assert (tmp_path / "died").exists()
