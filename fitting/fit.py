@@ -198,8 +198,8 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
         if densities and least < solution.chi2 / count < highest and not solution.interrupted:
             problem, solution, choices = best(densities, takes, problem, solution, choices)
     little = STEPS_FROM < solution.chi2 / count < min(FINER_FROM[1], highest) and not solution.interrupted
-    hats = hats_of_step(choices, bench, 1) or (choices,)
-    if little and choices.stiffness is None and has_steps(hats[0], bench):
+    hats = hats_of_step(choices, bench, 1)
+    if little and hats and has_steps(hats[0], bench):  # it may be steps that need more knots
         problem, solution, choices = best(hats, FINER_TAKES[1], problem, solution, choices)
     return problem, solution, choices
 

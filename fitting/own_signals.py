@@ -39,9 +39,13 @@ HEAT_RATE = 0.5  # of the pulsation, in units of the drift's: what cools fast br
 
 
 def drifts_of_one(recordings, spectra, bench):
-    """The recordings without the drift that one of them alone shows, and what there is to say of it, a sentence each."""
+    """The recordings without the drift that one of them alone shows, and what there is to say of it, a sentence each. Hum looks
+    like a drift in records shorter than its period, and hides one in others: what drifts must do so beside it."""
     if bench.quasistatic or bench.output != "displacement":
         return recordings, []
+    hum = next(e for e in record_effects(recordings, spectra) if e.name == "mains_hum")
+    if hum.z > RECORD_Z:
+        spectra = spectra_of(remove_record_effect(recordings, hum, bench.output), bench)
     return without_lone_drifts(recordings, lone_drifts(spectra), bench.output)
 
 

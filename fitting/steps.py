@@ -22,13 +22,13 @@ SETTLED = 2e-3  # share of chi2 that a round must move it by, to be followed by 
 
 
 def stepped(problem, solution, progress=None):
-    """The problem with a stiffness of each difference by itself, and its solution, from that of the problem as it is.
+    """A problem of one weight a family with a stiffness of each difference by itself instead, and its solution, from that of the
+    problem as it is.
 
     Returns (problem, solution); those that were given where the misfit is none that steps of the density leave.
     """
     basis, count, n = problem.basis, problem.data_count, problem.layout.density_unknowns
-    weights = solution.weights if problem.stiffness is None else problem.stiffness.weights
-    ones, begun, first = np.ones(len(weights)), problem, solution
+    weights, ones, begun, first = solution.weights, np.ones(len(solution.weights)), problem, solution
 
     def gone_on(most):
         """The solution from where it stands, with what it took so far."""

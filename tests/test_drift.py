@@ -8,7 +8,7 @@ import pytest
 from fitting.diagnosis import Diagnosis
 from fitting.floors import data_problem
 from fitting.own_signals import drifts_of_one
-from fitting.record_level import record_effects, remove_from_checks, remove_record_effect
+from fitting.record_level import lone_drifts, record_effects, remove_from_checks, remove_record_effect
 from fitting.setup import spectra_of
 from magjax.bench import load_bench
 from magjax.recording import Recording
@@ -156,3 +156,18 @@ def test_a_drift_of_one_record_alone_is_taken_out_of_it_and_told():
 def test_what_the_others_may_share_is_no_drift_of_one(frequencies, rate):
     runs = records(lambda t: rate * t, frequencies)
     assert drifts_of_one(runs, spectra_of(runs, BENCH), BENCH) == (runs, [])
+
+
+@pytest.mark.parametrize("drifting", [False, True], ids=["none drifts", "one drifts"])
+def test_hum_in_short_records_is_no_drift_of_one(drifting):
+    """A short record sees less than a period of the hum, which the longer ones show whole."""
+    phases = np.random.default_rng(2).uniform(0, 2 * np.pi, 9).tolist()
+    frequencies = (51.0, 228.0, 328.0, 10.0, 122.0, 14.0, 7.0, 65.0, 25.0)
+    runs = records(lambda t: 2e-7 * np.sin(2 * np.pi * 50.01 * t + phases.pop()), frequencies)
+    if drifting:
+        t, reading = runs[-1].time, runs[-1].channels["displacement"]
+        runs[-1] = Recording(t, {**runs[-1].channels, "displacement": reading + 8e-7 * t / t[-1]}, name="25 Hz")
+    spectra = spectra_of(runs, BENCH)
+    assert drifting or lone_drifts(spectra)  # without a look at the hum
+    _, told = drifts_of_one(runs, spectra, BENCH)
+    assert [said.split(" alone drifts")[0] for said in told] == ["25 Hz"] * drifting
