@@ -49,6 +49,16 @@ def has_steps(choices, bench) -> bool:
     return bench.drive == "current" and choices.knots is not None and choices.knots >= STEPS_ON
 
 
+def in_words(choices) -> str:
+    """Of what a density is made."""
+    if choices.rest == "held":
+        return "masses that are held"
+    if choices.knots is None:
+        return f"one mass a cell, {choices.cells or choices.level} cells along the plane"
+    steps = "" if choices.stiffness is None else ", a roughness weight for each of their differences"
+    return f"hats on {choices.knots[0]} x {choices.knots[1]} knots{steps}"
+
+
 def finest(choices) -> bool:
     """Whether no finer hats are tried than those of `choices`."""
     return choices.knots is not None and choices.knots >= FINER[-1][0]["knots"]

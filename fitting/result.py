@@ -10,6 +10,7 @@ import numpy as np
 
 from magjax.errors import ConfigurationError
 
+from .finer import in_words
 from .uncertainty import visited_cells
 
 
@@ -135,6 +136,7 @@ class FitResult:
             },
             "correlations": self.correlations,
             "cells": self.cells,
+            "density": in_words(self.choices) if self.choices else None,
             "levels": int(self.actuator.hysteresis.cells),
             "chi2_per_sample": self.chi2_per_sample,
             "bic": self.bic,

@@ -71,11 +71,12 @@ def test_silent_where_nothing_is_missing(bench):
             "next_experiment", "placebo", "message", "base", "repaired", "ties"} == set(content)  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        pytest.param(("mean_field", "linear_strain"), "absorbed", id="what the density hides", marks=pytest.mark.long),
-        pytest.param(("mean_field", "sensor_lag"), "nothing_missing", id="one that would show", marks=pytest.mark.long),
+        pytest.param(("mean_field", "linear_strain"), "absorbed", id="what the density hides"),
+        pytest.param(("mean_field", "sensor_lag"), "nothing_missing", id="one that would show"),
         pytest.param(("mains_hum",), "nothing_missing", id="one between the harmonics"),
     ],
 )

@@ -97,7 +97,8 @@ def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():
     assert [e.name for e in again.effects] == ["duffing_stiffness", "backlash"] and float(again.effects[0].k3) == 0.1
 
 
-@pytest.mark.parametrize("linkage", [pytest.param(0.0, marks=pytest.mark.long), 4e-3])
+@pytest.mark.long
+@pytest.mark.parametrize("linkage", [0.0, 4e-3])
 def test_a_limited_voltage_bounds_the_current(linkage):
     command, limit = np.asarray(CURRENT), 0.6
     effect = effects.AmplifierClipping(inverse_limit=1 / limit, tau_L=2e-3, linkage=linkage)
@@ -216,7 +217,8 @@ def test_a_rod_that_sticks_stays_calm_on_a_coarse_grid():
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.04 * np.sqrt(np.mean(fine**2))
 
 
-@pytest.mark.parametrize("frequency", [pytest.param(10.7, marks=pytest.mark.long), 175.0])
+@pytest.mark.long
+@pytest.mark.parametrize("frequency", [10.7, 175.0])
 def test_strong_friction_of_a_little_damped_rod_is_settled(frequency, monkeypatch):
     """The rod goes on swinging after each turn: a slow drive's samples are too few for it, a fast one's period too short."""
     from magjax.effects import coulomb_friction as module

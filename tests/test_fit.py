@@ -19,7 +19,7 @@ from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import DensityBasis, cell_basis, everett_values, hat_basis
 from fitting.experiments import _predicted
-from fitting.finer import FINER, cells_beside, finer_hats, finer_than
+from fitting.finer import FINER, cells_beside, finer_hats, finer_than, in_words
 from fitting.fit import finish, fit
 from fitting.joint import data_residual
 from fitting.outcome import beyond_the_rod, guessed, loose, valleys
@@ -153,6 +153,13 @@ def test_a_density_with_steps_is_met_and_foretells(bench):
     assert steps.problem.stiffness.fits(steps.problem.basis) and steps.unknowns < even.unknowns
     assert even.chi2_per_sample > 1.3 and steps.chi2_per_sample - 0.95 < 0.5 * (even.chi2_per_sample - 0.95)
     assert row["rms_after"] < row["rms_before"]
+
+
+def test_what_a_density_is_made_of_is_told(result):
+    assert result.as_dict()["density"] == "hats on 18 x 13 knots"
+    finer = dataclasses.replace(result.choices, knots=(26, 18), stiffness=object())
+    assert in_words(finer) == "hats on 26 x 18 knots, a roughness weight for each of their differences"
+    assert in_words(Choices(knots=None, cells=30)).startswith("one mass a cell, 30 ") and "held" in in_words(Choices(knots=None, rest="held"))
 
 
 def test_what_physics_leaves_no_steps_take(bench, recordings):

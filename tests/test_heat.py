@@ -78,6 +78,7 @@ def test_what_pulses_with_the_heat_is_heat_and_no_zero_that_drifts():
     assert all(r.residual_rms < 1.2 * r.noise_rms for r in freed.recordings)
 
 
+@pytest.mark.long
 def test_a_drift_that_does_not_pulse_is_not_said_to():
     task, adopted, base = examined(recorded(pulsation=False))
     assert adopted and base.chi2_per_sample > 5  # by the zeros

@@ -45,10 +45,8 @@ SPOILT = {
 }
 
 
-FEW = ("gain",)
-
-
-@pytest.mark.parametrize("kind", [k if k in FEW else pytest.param(k, marks=pytest.mark.long) for k in SPOILT])
+@pytest.mark.long
+@pytest.mark.parametrize("kind", SPOILT)
 def test_one_number_mends_a_spoilt_recording(kind):
     how, words = SPOILT[kind]
     row = record(TRUTH, 80, 0.5, 0.05, np.random.default_rng(3), "80 Hz")

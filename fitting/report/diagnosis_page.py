@@ -406,7 +406,7 @@ def _models(found, evidence, sketch, drive):
                 for t in tables.parameters(repaired, validity(repaired)[3], f"Parameters of {repair_words(found)}", bounds_of(best))
             ),
             part(table=tables.correlations(repaired)),
-            part(text=plane.never_switched(best)),
+            part(text=plane.told(best, repaired)),
             sketch(best, plane.mass_map, best, doubt=_doubt(repaired)),
             sketch(best.get("inside"), loops.inside, best, drive),
             convergence_part(sketch, repaired),
@@ -424,7 +424,7 @@ def _models(found, evidence, sketch, drive):
                 []
                 if repaired
                 else [
-                    part(text=plane.never_switched(best)),
+                    part(text=plane.told(best, base)),
                     sketch(best, plane.mass_map, best, doubt=doubt),
                     sketch(best.get("inside"), loops.inside, best, drive),
                 ]

@@ -74,7 +74,7 @@ def fit_page(fit, evidence, say=lambda text: None) -> dict:
         ),
         residual_section(sketch, evidence, output),
         section(
-            "The Preisach plane", part(text=plane.never_switched(evidence)), sketch(evidence, plane.mass_map, evidence, doubt=doubt)
+            "The Preisach plane", part(text=plane.told(evidence, fit)), sketch(evidence, plane.mass_map, evidence, doubt=doubt)
         ),
         section("Inside the model", sketch(evidence.get("inside"), loops.inside, evidence, drive)),
         section("How the fit went", convergence_part(sketch, fit), part(table=tables.numbers(fit))),

@@ -6,6 +6,12 @@ from matplotlib.colors import PowerNorm
 from .style import INK, MUTED, SEQUENTIAL, canvas, per, percent, picture, styled, terms_in
 
 
+def told(evidence, fit) -> str:
+    """Of what the density of a fit is made, and how much of the plane its recordings say nothing of, in words."""
+    made = fit.get("density")  # results of earlier versions do not say it
+    return " ".join(filter(None, [f"The density is made of {made}." if made else "", never_switched(evidence)]))
+
+
 def never_switched(evidence) -> str:
     """How much of the plane the recordings say nothing of, in words; "" where there is no evidence."""
     if "plane" not in evidence:

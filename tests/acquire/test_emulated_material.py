@@ -58,6 +58,7 @@ def test_two_runs_are_one_long_simulation(bench):
     assert np.abs(alone[:, 1] - played[2][:, 1]).max() > 0.02 * np.ptp(whole)  # the past shows
 
 
+@pytest.mark.long
 def test_a_reversal_after_a_run_starts_where_that_one_ended(bench):
     box = device(bench)
     play(box, 0.6)

@@ -21,7 +21,7 @@ from fitting.report.fit_page import diagnose_command, sentence, validity
 from fitting.report.learned import learned_function
 from fitting.report.loops import inside, loops
 from fitting.report.page import kept_together
-from fitting.report.plane import never_switched
+from fitting.report.plane import never_switched, told
 from fitting.report.residuals import repeating, strokes
 from fitting.report.tables import interval as interval_of
 from fitting.report.tables import recordings as recordings_table
@@ -369,6 +369,7 @@ def test_loops_say_what_was_added_and_what_the_band_is(diagnoses, folders, tmp_p
 def test_a_fit_says_how_many_cells_were_never_switched(folders):
     evidence = store.load(folders["fit"])
     said = never_switched(evidence)
+    assert told(evidence, {"density": "hats on 18 x 13 knots"}) == f"The density is made of hats on 18 x 13 knots. {said}" and told(evidence, {}) == said
     assert said and said in (folders["fit"] / "report.html").read_text(encoding="utf-8")
     lower = np.tril(np.ones((4, 4), bool))
     assert never_switched({"plane": {"seen": lower}}).startswith("Every one of the 10 cells is switched")

@@ -25,6 +25,7 @@ def plain():
     return sweep(load_bench("aa-050h").actuator(), **GRID)
 
 
+@pytest.mark.long
 def test_processes_and_a_resumed_sweep(plain, tmp_path):
     actuator, path = load_bench("aa-050h").actuator(), tmp_path / "sweep"
     seen = []

@@ -36,6 +36,7 @@ FIT = {
     "cells": "of the Preisach plane",
     "cells.switched": "cells that some recording switches; masses of the others are not identified",
     "cells.all": "cells in all",
+    "density": "of what the density is made, in words: hats on so many knots or masses of cells, with roughness weights of their own where it has steps",
     "levels": "cells along the Preisach plane of the fitted density, with those below and above every recorded field",
     "chi2_per_sample": "misfit in units of the noise over all recordings",
     "bic": "Bayesian information criterion; differences below -10 mean something",
