@@ -53,9 +53,9 @@ def in_words(choices) -> str:
     """Of what a density is made."""
     if choices.rest == "held":
         return "masses that are held"
-    if choices.knots is None:
-        return f"one mass a cell, {choices.cells or choices.level} cells along the plane"
     steps = "" if choices.stiffness is None else ", a roughness weight for each of their differences"
+    if choices.knots is None:
+        return f"masses of cells, {choices.cells or choices.level} along the plane{steps}"
     return f"hats on {choices.knots[0]} x {choices.knots[1]} knots{steps}"
 
 

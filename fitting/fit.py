@@ -201,6 +201,9 @@ def _refine_density(problem, solution, actuator, bench, names, choices, spectra,
     hats = hats_of_step(choices, bench, 1)
     if little and hats and has_steps(hats[0], bench):  # it may be steps that need more knots
         problem, solution, choices = best(hats, FINER_TAKES[1], problem, solution, choices)
+    if choices.cells is not None and STEPS_FROM < solution.chi2 / count < highest and not solution.interrupted:
+        problem, solution = stepped(problem, solution, functools.partial(report, "steps of the density"))
+        choices = dataclasses.replace(choices, stiffness=problem.stiffness)
     return problem, solution, choices
 
 

@@ -1,6 +1,7 @@
 """The joint fit on an invented bench: the noise reached, the constants within their errors, determinism, outcomes."""
 
 import dataclasses
+import importlib
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from fitting.check import check_errors
 from fitting.demo import concealed_actuator, record
 from fitting.density import DensityBasis, cell_basis, everett_values, hat_basis
 from fitting.experiments import _predicted
-from fitting.finer import FINER, cells_beside, finer_hats, finer_than, in_words
+from fitting.finer import CELLS, FINER, cells_beside, finer_hats, finer_than, in_words
 from fitting.fit import finish, fit
 from fitting.joint import data_residual
 from fitting.outcome import beyond_the_rod, guessed, loose, valleys
@@ -39,6 +40,7 @@ from magjax.simulate import simulate
 from tests.studies.joint_fit import NAMES, SINES, TRUTH, one_draw, settled
 
 TRUE = {"coil.R_eddy": 62.0, "mechanics.xi": 0.81, "mechanics.f0": 405.0}
+fitting_fit = importlib.import_module("fitting.fit")  # not the function
 QUICK = Choices(fine=250)
 
 
@@ -143,11 +145,16 @@ def with_steps(runs, bench):
     return even, finish(problem, solution, dataclasses.replace(even.choices, stiffness=problem.stiffness), bench, runs)
 
 
-def test_a_density_with_steps_is_met_and_foretells(bench):
-    """What random cells leave under one roughness weight a family passes for physics; Student's law leaves little of it."""
+def on_random_cells(bench):
+    """Recordings of a bench whose density is random cells, and one to check."""
     truth, rng = with_random_cells(bench), np.random.default_rng(3)
     drives = (10, 0.8, 0.1), (50, 0.5, -0.2), (150, 0.8, 0.1), (300, 0.5, 0.0)
-    runs, check = [record(truth, *d, rng, f"{d[0]}") for d in drives], record(truth, 30, 0.65, 0.0, rng, "check")
+    return [record(truth, *d, rng, f"{d[0]}") for d in drives], record(truth, 30, 0.65, 0.0, rng, "check")
+
+
+def test_a_density_with_steps_is_met_and_foretells(bench):
+    """What random cells leave under one roughness weight a family passes for physics; Student's law leaves little of it."""
+    runs, check = on_random_cells(bench)
     even, steps = with_steps(runs, bench)
     (row,) = check_errors(even.actuator, steps.actuator, [check], bench)
     assert steps.problem.stiffness.fits(steps.problem.basis) and steps.unknowns < even.unknowns
@@ -155,11 +162,24 @@ def test_a_density_with_steps_is_met_and_foretells(bench):
     assert row["rms_after"] < row["rms_before"]
 
 
+def test_cells_that_were_chosen_get_steps(bench, monkeypatch):
+    """One roughness weight a family is as wrong of cells as of hats."""
+    monkeypatch.setattr("fitting.finer.FINER", ((), CELLS[:1], ()))
+    monkeypatch.setattr(fitting_fit, "CELLS_MEET", 3.0)
+    runs, _ = on_random_cells(bench)
+    found = fit(runs, bench, choices=QUICK)
+    monkeypatch.setattr(fitting_fit, "STEPS_FROM", np.inf)
+    even = fit(runs, bench, choices=QUICK)
+    assert found.choices.cells == even.choices.cells == 30 and even.choices.stiffness is None
+    assert found.choices.stiffness.fits(found.problem.basis) and in_words(found.choices).endswith("a roughness weight for each of their differences")
+    assert found.chi2_per_sample < even.chi2_per_sample - 0.05, (found.chi2_per_sample, even.chi2_per_sample)
+
+
 def test_what_a_density_is_made_of_is_told(result):
     assert result.as_dict()["density"] == "hats on 18 x 13 knots"
     finer = dataclasses.replace(result.choices, knots=(26, 18), stiffness=object())
     assert in_words(finer) == "hats on 26 x 18 knots, a roughness weight for each of their differences"
-    assert in_words(Choices(knots=None, cells=30)).startswith("one mass a cell, 30 ") and "held" in in_words(Choices(knots=None, rest="held"))
+    assert in_words(Choices(knots=None, cells=30)).startswith("masses of cells, 30 ") and "held" in in_words(Choices(knots=None, rest="held"))
 
 
 def test_what_physics_leaves_no_steps_take(bench, recordings):
