@@ -14,6 +14,7 @@ from .finer import FINER_FROM
 from .on_lines import heat_score, hum_score, offset_score, zeros_score
 from .record_level import (
     by_heat,
+    hum_between,
     hum_is_seen,
     hum_of,
     lone_drifts,
@@ -43,7 +44,7 @@ def drifts_of_one(recordings, spectra, bench):
     like a drift in records shorter than its period, and hides one in others: what drifts must do so beside it."""
     if bench.quasistatic or bench.output != "displacement":
         return recordings, []
-    hum = next(e for e in record_effects(recordings, spectra) if e.name == "mains_hum")
+    hum = hum_between(spectra)
     if hum.z > RECORD_Z:
         spectra = spectra_of(remove_record_effect(recordings, hum, bench.output), bench)
     return without_lone_drifts(recordings, lone_drifts(spectra), bench.output)

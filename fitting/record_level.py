@@ -64,15 +64,18 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
         found["zero_drift"] = own
         if may_be_heat(own, spectra):
             found["thermal_drift"] = by_heat(own, spectra)
+    found["mains_hum"] = hum_between(spectra)
+    return sorted(found.values(), key=lambda e: -abs(e.z))
+
+
+def hum_between(spectra) -> RecordEffect:
+    """Hum between the harmonics, of the mains frequency that shows more; z is 0 where most recordings deny it."""
+    rows = []
     for f in MAINS:
         z, tones, fits = _hum(spectra, f)
-        z = z if hum_is_seen(spectra, tones) else 0.0
-        if "mains_hum" not in found or z > found["mains_hum"].z:
-            error = tones[0][1] / max(z, 1.0)
-            found["mains_hum"] = RecordEffect(
-                "mains_hum", float(z), tones[0][1], float(error), {"f": f, "tones": tones}, tuple(fits)
-            )
-    return sorted(found.values(), key=lambda e: -abs(e.z))
+        z = float(z) if hum_is_seen(spectra, tones) else 0.0
+        rows.append(RecordEffect("mains_hum", z, tones[0][1], tones[0][1] / max(z, 1.0), {"f": f, "tones": tones}, tuple(fits)))
+    return max(rows, key=lambda e: e.z)
 
 
 def mean_heat(spectra) -> np.ndarray:

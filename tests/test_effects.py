@@ -97,8 +97,7 @@ def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():
     assert [e.name for e in again.effects] == ["duffing_stiffness", "backlash"] and float(again.effects[0].k3) == 0.1
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("linkage", [0.0, 4e-3])
+@pytest.mark.parametrize("linkage", [pytest.param(0.0, marks=pytest.mark.long), 4e-3])
 def test_a_limited_voltage_bounds_the_current(linkage):
     command, limit = np.asarray(CURRENT), 0.6
     effect = effects.AmplifierClipping(inverse_limit=1 / limit, tau_L=2e-3, linkage=linkage)

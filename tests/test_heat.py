@@ -63,7 +63,6 @@ def test_a_sine_warms_the_rod_as_the_exact_solution_does():
     assert np.array_equal(np.asarray(still), t)
 
 
-@pytest.mark.long
 def test_what_pulses_with_the_heat_is_heat_and_no_zero_that_drifts():
     task, adopted, base = examined(recorded())
     assert base.chi2_per_sample > 5
