@@ -21,6 +21,7 @@ from ..effects.base import Trial
 from ..errors import ConfigurationError
 from ..preisach.memory import Memory, apply_field, branch_magnetization
 from .closed_form import solve_branch
+from .loops import tied
 from .newton import LOSSES, Posed, extra_of, extra_terms, solve_with_effects, trial_of
 
 SCHEMES = ("bdf2", "trapezoid")
@@ -153,7 +154,7 @@ def run_march(march: March, applied, current, disturbance=None, period: int = 0)
     """All samples of a march: field H, magnetization M, its spread, relay field, residual, (time,) each, and overflow."""
     ends = _ends_of_periods(len(applied), period)
     drive = (applied[1:], current[1:], ends, *(d[1:] for d in disturbance or ()))
-    carry, rows = jax.lax.scan(march.advance, march.carry, drive)
+    carry, rows = jax.lax.scan(march.advance, tied(march.carry, applied), drive)
     # the first sample of a rod in shells is their mean
     whole = (jnp.concatenate([jnp.reshape(x.mean(), (1,)), y]) for x, y in zip(march.first, rows, strict=True))
     return *whole, carry.memory.overflow.any()
@@ -182,7 +183,7 @@ def run_until_steady(march: March, applied, current, tolerance, most):
         return carry, rows, jnp.where(number > 0, change, jnp.inf), number + 1
 
     rows = (jnp.zeros(count),) * 5
-    carry, rows, change, _ = jax.lax.while_loop(going, again, (march.carry, rows, jnp.asarray(jnp.inf), 0))
+    carry, rows, change, _ = jax.lax.while_loop(going, again, tied((march.carry, rows, jnp.inf, 0), applied))
     return *rows, carry.memory.overflow.any(), change
 
 
@@ -234,5 +235,5 @@ def disturbance_of(effect, actuator, field, magnetization, current, h, period: i
         return (state, mark, X1, X0, v), row
 
     ends = _ends_of_periods(len(field), period)
-    rows = jax.lax.scan(advance, (state, state, X[0], X[0], field[0]), (field[1:], magnetization[1:], current[1:], X[1:], ends))[1]
+    rows = jax.lax.scan(advance, tied((state, state, X[0], X[0], field[0]), X), (field[1:], magnetization[1:], current[1:], X[1:], ends))[1]
     return tuple(jnp.concatenate([zero[None], r]) for r in rows)

@@ -18,6 +18,7 @@ from jax.lax import stop_gradient
 from ..preisach.memory import Memory, apply_field, branch_magnetization
 from .closed_form import pushed, unmoved
 from .coupled import _at_rest, _ends_of_periods, _law, _rested, march_of, run_march
+from .loops import tied
 from .newton import stop_gradient_trial
 
 
@@ -90,7 +91,7 @@ def _branches(table, memory: Memory, fields):
         rising, kept, threshold, place = memory.branch(corners, field)
         return memory.move(rising, kept, field, number), (rising, place.astype(int), threshold)
 
-    return jax.lax.scan(advance, memory, (fields[1:], first + jnp.arange(1.0, len(fields))))[1]
+    return jax.lax.scan(advance, tied(memory, fields), (fields[1:], first + jnp.arange(1.0, len(fields))))[1]
 
 
 def _replay(scheme, period, fields, actuator, applied, current, h, memory, disturbance):
@@ -117,7 +118,7 @@ def _replay(scheme, period, fields, actuator, applied, current, h, memory, distu
 
     drive = (applied[1:], current[1:], _ends_of_periods(count, period), *(d[1:] for d in disturbance or ()))
     numbers = places.shape[0] - count + jnp.arange(1, count)
-    rows = jax.lax.scan(advance, carry, (drive, numbers, known))[1]
+    rows = jax.lax.scan(advance, tied(carry, applied), (drive, numbers, known))[1]
     return tuple(jnp.concatenate([x[None], y]) for x, y in zip(first, rows, strict=True))
 
 
@@ -176,8 +177,8 @@ class Steps(eqx.Module):
     by (state before, fields and M of the corners, what is added to M of the relays, applied field, current, and the three of a
     disturbance, see `magnetize`, parameters). `place`: (steps, shells), of the corner; `rising`, `threshold`, A/m: of the branch.
     `ended`: (periods, d, states), of the state after the last step of every period by what the states of effects were a period earlier
-    (`coupled._settle`); they stand last in a state. `rest`: (d, shells + 2 + parameters), of the first state by (M of the relays, applied
-    field, current, parameters).
+    (`coupled._settle`), of none where no effect is slow; they stand last in a state. `rest`: (d, shells + 2 + parameters), of the first
+    state by (M of the relays, applied field, current, parameters).
     `corners`: (2, corners), fields of maxima and minima before the first step; `moved`: (before, 2), of the older places by the applied field
     of the first sample. `field`, `magnetization`, `spread`: H, M and the variance of M over the section, (steps + 1,), `relay_field`: (steps + 1, shells), A/m.
     """
@@ -219,7 +220,7 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
         return then, (_flat(carry)[0], ravel_pytree(carry.marks)[0], *relays, *row[:3])
 
     ends = _ends_of_periods(len(applied), period)
-    flat, marks, *rows = jax.lax.scan(advance, march.carry, (applied[1:], current[1:], ends))[1]
+    flat, marks, *rows = jax.lax.scan(advance, tied(march.carry, applied), (applied[1:], current[1:], ends))[1]
     first = (x * jnp.ones(shells) for x in (memory.field, memory.magnetization))
     v, m, H, M, spread = (jnp.concatenate([x[None], y]) for x, y in zip((*first, *(x.mean() for x in march.first[:3])), rows, strict=True))
     known = jax.vmap(lambda v: _known(table, memory, v), 1, 1)(v)
@@ -242,7 +243,9 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     given = jnp.concatenate(given, axis=1), marks, ends, known
     slopes = jax.vmap(jax.jacfwd(one))(*given)
     last = jax.tree.map(lambda x: x[period - 1 :: period], given)
-    ended = jax.vmap(jax.jacfwd(lambda marks, given: one(given[0], marks, *given[2:])[: len(rest)]))(last[1], last)
+    ended = jnp.zeros((len(last[0]), len(rest), 0))
+    if any(e.slow for e in actuator.effects if e.in_step):
+        ended = jax.vmap(jax.jacfwd(lambda marks, given: one(given[0], marks, *given[2:])[: len(rest)]))(last[1], last)
 
     def rested(given):
         m, (applied, current), parameters = given[:shells], given[shells : shells + 2], given[shells + 2 :]

@@ -16,6 +16,7 @@ from ..constants import MU0
 from ..effects.base import Trial
 from ..preisach.memory import branch_magnetization
 from .closed_form import polish, pushed, slope_of, solve_frozen, unmoved
+from .loops import tied
 
 LOSSES = ("source", "coil")  # blocks whose effects take from the applied field
 CLOSE_ENOUGH = 1e-12  # of half the plane; the polish squares what is left
@@ -88,7 +89,7 @@ def solve_with_effects(scheme: str, posed: Posed):
 
     before = posed.carry.before
     guess = 2 * memory.field - before[0], 2 * memory.magnetization - before[1]
-    state = (guess, linear(*guess), jnp.asarray(False), jnp.asarray(0), jnp.full_like(rhs, jnp.inf), 0)
+    state = tied((guess, linear(*guess), False, 0, jnp.full_like(rhs, jnp.inf), 0), rhs)
     (v, m), _, rising, kept, left, _ = jax.lax.while_loop(open_yet, again, state)
     settled = jnp.abs(left) <= CLOSE_ENOUGH * reach
     return _bracketed(posed, added, reach, settled, (v, m, rising, kept))
@@ -117,7 +118,7 @@ def _bracketed(posed, added, reach, settled, found):
         return (walk[3] > CLOSE_ENOUGH * reach) & (walk[4] < MOST_STEPS)
 
     start = jnp.where(settled, found[0], memory.field)
-    walk = ((start, *found[1:]), start - reach, start + reach, jnp.where(settled, 0.0, reach), 0)
+    walk = tied(((start, *found[1:]), start - reach, start + reach, jnp.where(settled, 0.0, reach), 0), rhs)
     return jax.lax.while_loop(unsettled, refine, walk)[0]
 
 

@@ -25,6 +25,7 @@ from ..linear import inverse_of
 from ..preisach.memory import apply_field, branch_magnetization
 from .closed_form import slope_of
 from .coupled import March, _settle, run_march
+from .loops import tied
 from .newton import extra_terms
 
 CLOSE_ENOUGH = 1e-10  # A/m relative to half the plane
@@ -212,7 +213,7 @@ def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
     def unsettled(walk):
         return (walk[4] > CLOSE_ENOUGH * reach) & (walk[5] < MOST_STEPS)
 
-    walk = (start, jnp.zeros_like(start), jnp.zeros(()), jnp.ones(()), jnp.full((), jnp.inf), 0)
+    walk = tied((start, jnp.zeros_like(start), jnp.zeros(()), jnp.ones(()), jnp.full((), jnp.inf), 0), start)
     v = stop_gradient(jax.lax.while_loop(unsettled, refine, walk)[0])
     inverse = stop_gradient(inverse_of(misfit(v)[1]))
     _, slope, rising, kept = stop_gradient(_relays(fixed[0], fixed[1].memory, v))
