@@ -32,7 +32,7 @@ DETAIL_SHARE = 0.3  # of the misfit that an effect takes where the details of it
 AT_NOISE = 0.92  # chi2/N at which a fit with nothing missing ends
 MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
 ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
-MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart
+MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart, growing from none where the noise is met
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,11 +231,12 @@ def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
         foretold = "" if near == WEAK_TIE else ", and with the best the check recordings are still missed about as far as without"
         return f"it meets the noise too (chi2/N below {SETTLED_CHI2:g}), {behind:.0f} in chi2 behind the best{foretold}"
     left = best.result.chi2_per_sample
-    if left > MISFIT and left_by_density(best.result):
+    if left > SETTLED_CHI2 and left_by_density(best.result):
         least = TIE * left
         return f"what is left is a rough density's, and its BIC or AIC comes within {TIE:g} times that of the best's" if behind < least else ""
-    if left > MISFIT and behind < MISFIT_TIE * chi2_of(best.result):
-        return f"the best leaves a misfit itself, of which {behind:.0f} in chi2 behind it are less than {MISFIT_TIE:.0%}"
+    share = MISFIT_TIE * min(max(left - SETTLED_CHI2, 0.0) / (MISFIT - SETTLED_CHI2), 1.0)
+    if behind < share * chi2_of(best.result):
+        return f"the best leaves a misfit itself, of which {behind:.0f} in chi2 behind it are less than {share:.1%}"
     if behind < 2 * TIE and _same(t, best):
         return f"to first order it does the same to the reading, and its BIC or AIC comes within {2 * TIE:g} of the best's"
     return ""

@@ -260,6 +260,13 @@ def test_rivals_where_the_best_is_not_the_whole_truth():
     assert "a rough density's" in tie_of(best, trial("sensor_lag", 2.02, base=300.0))  # 14 in chi2, of which 18 are one to the noise
 
 
+@pytest.mark.parametrize(("left", "behind", "tied"), [(1.29, 60, True), (1.2, 60, False), (1.2, 30, True), (1.13, 15, False), (1.31, 90, True)])
+def test_the_more_the_best_leaves_the_farther_off_are_its_rivals(left, behind, tied):
+    """A field that differs along the rod was called friction, which left 1.295, structural_damping 15 behind."""
+    best, other = trial("coulomb_friction", left, direction=(1, 0, 0)), trial("structural_damping", left + behind / COUNT, direction=(0, 1, 0))
+    assert ("leaves a misfit itself" in tie_of(best, other)) is tied
+
+
 def test_confidence_falls_with_rivals_and_with_what_is_left():
     alone, rival = trial("backlash", 0.92), trial("creep", 0.9201, direction=(0, 1, 0))
     assert confidence(alone, [alone]) == 0.99
