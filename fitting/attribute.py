@@ -198,11 +198,16 @@ def credited(candidate, result, base, effect, excess) -> Trial:
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
     drop = chi2_of(base) - chi2_of(result)
-    physical = all(map(_physical, result.actuator.effects))
+    physical = all(_physical(e) and e.is_seen(highest_line(result)) for e in result.actuator.effects)
     number = len(effect.free_parameters())
     extra = number * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
     return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), number)
+
+
+def highest_line(result) -> float:
+    """The highest frequency, Hz, of the lines that a fit meets."""
+    return max((s.frequency * (len(s.reading) - 1) for s in result.spectra), default=np.inf)
 
 
 def _physical(effect) -> bool:

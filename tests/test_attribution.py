@@ -12,7 +12,7 @@ import fitting.exchange
 import fitting.search
 import fitting.trials
 import fitting.verdict
-from fitting.attribute import Trial, _physical, chi2_of, confidence, excess_of, family, leaders, rivals_of, tie_of
+from fitting.attribute import Trial, _physical, chi2_of, confidence, credited, excess_of, family, leaders, rivals_of, tie_of
 from fitting.density import Stiffness
 from fitting.diagnosis import Evidence
 from fitting.exchange import both_found
@@ -229,7 +229,7 @@ def test_a_feedback_beside_the_noise_is_begun_from_a_springs_size_too(left, star
     rod, begun = load_bench("aa-050h").actuator(), []
 
     def ended(chi2n, actuator):
-        return SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=actuator, converged=True)
+        return SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=actuator, converged=True, spectra=())
 
     class Fits:
         def fit(self, actuator, **how):
@@ -557,6 +557,16 @@ def test_a_law_bent_into_another_is_not_named(effect, physical):
     """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop, friction that
     is viscous throughout a delay beside a creep, a turn round the coil that opposes more than its field an amplifier's lag of two poles."""
     assert _physical(effect) is physical
+
+
+@pytest.mark.parametrize(("f2", "physical"), [(900.0, True), (28000.0, False)])
+def test_a_mode_above_all_lines_is_none(f2, physical):
+    """At 28 kHz, beside lines up to 11.5 kHz, it had stood among the rivals of an amplifier's lag."""
+    effect = CLASSES["second_mode"](gain=-0.002, f2=f2)
+    spectra = [SimpleNamespace(frequency=f, reading=np.zeros(41)) for f in (6.0, 288.0)]
+    result = SimpleNamespace(chi2_per_sample=0.9, data_count=COUNT, actuator=SimpleNamespace(effects=[effect]), spectra=spectra)
+    base = SimpleNamespace(chi2_per_sample=2.7, data_count=COUNT)
+    assert credited(candidate("second_mode", 20.0), result, base, effect, 1000.0).physical is physical
 
 
 def evidence_of(monkeypatch, chi2n, before, after):

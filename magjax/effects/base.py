@@ -95,6 +95,10 @@ class AbstractEffect(eqx.Module):
         """Whether its parameters are those of what it is named for: elsewhere its law may imitate what it is not."""
         return True
 
+    def is_seen(self, highest: float) -> bool:
+        """Whether recordings whose lines end at `highest`, Hz, reach what it is named for: below it its law may imitate what it is not."""
+        return True
+
     @classmethod
     def elsewhere(cls) -> tuple:
         """Where else a fit may begin, far from the null, for laws whose first order misleads: effects with all their parameters."""

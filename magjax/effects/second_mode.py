@@ -33,6 +33,10 @@ class SecondMode(AbstractEffect):
         """Not where it is overdamped: two lags and no mode, which imitate whatever relaxes."""
         return bool(self.xi2 < 1)
 
+    def is_seen(self, highest: float) -> bool:
+        """Not where its resonance is above all lines: what it does below is what a delay does."""
+        return bool(self.f2 < highest)
+
     def displacement(self, displacement, free_displacement, signals, line, actuator):
         """Displacement with the second mode, m."""
         w2 = 2 * jnp.pi * self.f2
