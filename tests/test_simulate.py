@@ -9,6 +9,7 @@ import pytest
 from magjax.actuator import Actuator
 from magjax.bench import load_bench
 from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics
+from magjax.chain.loops import tied
 from magjax.chain.march import _march_all, _marched
 from magjax.effects.excess_loss import ExcessLoss
 from magjax.effects.magnetic_aftereffect import MagneticAftereffect
@@ -246,3 +247,32 @@ def test_a_sweep_tells_a_lost_corner(monkeypatch):
     )
     with pytest.raises(ConfigurationError, match="amplitude 0.5, offset 0 leaves more than 4 nested corners"):
         sweep(load_bench("aa-050h").actuator(), [10.0], [0.5])
+
+
+def test_a_loop_that_begins_mapped_is_traced_once_under_vmap():
+    """Its body is otherwise gone through again for each part of its carry that turns out to be mapped."""
+
+    def mapped(start_of):
+        gone_through = []
+
+        @jax.custom_batching.custom_vmap
+        def halved(x):
+            return 0.5 * x
+
+        @halved.def_vmap
+        def of_all(size, which, x):
+            gone_through.append(which)
+            return halved(x), True
+
+        def one(x):
+            def again(state):
+                near, before, number = state
+                return halved(near + x), near, number + 1
+
+            return jax.lax.while_loop(lambda s: (s[2] < 9) & (s[1] > -1.0), again, start_of((jnp.zeros(()), jnp.ones(()), 0), x))[0]
+
+        return np.asarray(jax.vmap(one)(jnp.arange(3.0))), len(gone_through)
+
+    plain, often = mapped(lambda start, x: start)
+    found, once = mapped(tied)
+    assert once == 1 < often and np.array_equal(found, plain)
