@@ -60,11 +60,14 @@ def of_two(task, best, left, good):
         promised = chi2_of(rival.result) - first.z**2
         if first.z**2 > HALF * excess and promised < chi2_of(best.result) - MIN_DROP:
             ahead.append((promised, rival, scores))
+    least = chi2_of(best.result) - max(BIC_DROP, HALF * excess_of(best.result))
+    of_one = np.log(best.result.data_count)  # what BIC charges a parameter
+    useful = min(near * best.result.data_count, least + best.parameters * of_one)  # a pair that cannot come there ends early
     for _, rival, scores in sorted(ahead, key=lambda row: row[0]):
-        pair = to_the_end(task, rival.result, scores[0], excess_of(rival.result))
-        cost = (rival.parameters + pair.parameters - best.parameters) * np.log(pair.result.data_count)
+        pair = to_the_end(task, rival.result, scores[0], excess_of(rival.result), useful)
+        cost = (rival.parameters + pair.parameters - best.parameters) * of_one
         met = pair.physical and pair.result.chi2_per_sample < near
-        if met and chi2_of(pair.result) + cost < chi2_of(best.result) - max(BIC_DROP, HALF * excess_of(best.result)):
+        if met and chi2_of(pair.result) + cost < least:
             return rival, scores
     return best, left
 

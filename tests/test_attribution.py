@@ -675,10 +675,13 @@ def searched(monkeypatch, ends, follows):
     trials = [trial(n, x, base=110.0, direction=d) for n, x, d in ends]
     scores = {id(t.result): [candidate(follows[t.name][0], follows[t.name][1])] for t in trials}
     monkeypatch.setattr(fitting.adoption, "screened", lambda result, choices: scores[id(result)])
-    monkeypatch.setattr(
-        fitting.adoption, "to_the_end",
-        lambda task, result, c, excess: next(trial(c.name, follows[t.name][2], 2) for t in trials if t.result is result),
-    )  # fmt: skip
+
+    def fitted(task, result, c, excess, target):
+        """What ends above the target is of no use: it may end anywhere."""
+        chi2n = next(follows[t.name][2] for t in trials if t.result is result)
+        return trial(c.name, chi2n if chi2n * COUNT < target else 99.0, 2)
+
+    monkeypatch.setattr(fitting.adoption, "to_the_end", fitted)
     best = trials[0]
     return fitting.adoption.of_two(Task((), None), best, scores[id(best.result)], trials)[0].name
 
