@@ -236,11 +236,11 @@ def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
         foretold = "" if near == WEAK_TIE else ", and with the best the check recordings are still missed about as far as without"
         return f"it meets the noise too (chi2/N below {SETTLED_CHI2:g}), {behind:.0f} in chi2 behind the best{foretold}"
     left = best.result.chi2_per_sample
-    if left > SETTLED_CHI2 and left_by_density(best.result):
-        least = TIE * left
-        return f"what is left is a rough density's, and its BIC or AIC comes within {TIE:g} times that of the best's" if behind < least else ""
     share = MISFIT_TIE * min(max(left - SETTLED_CHI2, 0.0) / (MISFIT - SETTLED_CHI2), 1.0)
-    if behind < share * chi2_of(best.result):
+    if share and left_by_density(best.result):
+        if behind < TIE * left:
+            return f"what is left is a rough density's, and its BIC or AIC comes within {TIE:g} times that of the best's"
+    elif behind < share * chi2_of(best.result):
         return f"the best leaves a misfit itself, of which {behind:.0f} in chi2 behind it are less than {share:.1%}"
     if behind < 2 * TIE and _same(t, best):
         return f"to first order it does the same to the reading, and its BIC or AIC comes within {2 * TIE:g} of the best's"
