@@ -241,7 +241,7 @@ def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
         if behind < TIE * left:
             return f"what is left is a rough density's, and its BIC or AIC comes within {TIE:g} times that of the best's"
     elif behind < share * chi2_of(best.result):
-        return f"the best leaves a misfit itself, of which {behind:.0f} in chi2 behind it are less than {share:.1%}"
+        return f"the best leaves a misfit itself, and this is {behind:.0f} in chi2 behind it: less than {share:.1%} of that"
     if behind < 2 * TIE and _same(t, best):
         return f"to first order it does the same to the reading, and its BIC or AIC comes within {2 * TIE:g} of the best's"
     return ""
