@@ -10,8 +10,6 @@ import dataclasses
 
 import numpy as np
 
-from magjax.recording import Recording
-
 from .spectra import evaluate_lines
 
 RATIO = 6.0  # mean square of the alternation over what noise leaves in it
@@ -73,7 +71,7 @@ def alternating(recordings, spectra, output: str) -> Alternation | None:
         alternate = np.zeros(len(recording.time))
         alternate[: s.samples] = np.where(np.floor(cycles + 1e-9) % 2 == 0, there, -there)
         channels = {**recording.channels, output: np.asarray(recording.channels[output], float) - alternate}
-        cleaned.append(Recording(recording.time, channels, recording.noise, recording.origin, recording.name))
+        cleaned.append(dataclasses.replace(recording, channels=channels))
     shown = np.mean(np.asarray(seen) > RATIO)
     if len(seen) < 2 or shown < RECORDINGS:
         return None

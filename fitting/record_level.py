@@ -8,7 +8,6 @@ import dataclasses
 import numpy as np
 
 from magjax.plausibility import si_unit
-from magjax.recording import Recording
 
 from .spectra import evaluate_lines, fit_lines, reduce_recording, with_noise
 
@@ -290,7 +289,7 @@ def remove_record_effect(recordings, effect, output):
             origin = {**origin, "hum": effect.shapes["tones"]}
         elif effect.shapes.get("own"):
             origin = {**origin, "drift": float(np.abs(column).max())}
-        cleaned.append(Recording(recording.time, channels, recording.noise, origin, recording.name))
+        cleaned.append(dataclasses.replace(recording, channels=channels, origin=origin))
     return cleaned
 
 

@@ -12,7 +12,6 @@ import dataclasses
 import numpy as np
 
 from magjax.plausibility import si_unit
-from magjax.recording import Recording
 
 from .attribute import MISFIT
 from .check import beyond_plane, prediction, predictions
@@ -170,4 +169,4 @@ def _driven(recording, factor, bench):
 
 def _clocked(recording, factor, bench):
     """The recording with its times times a factor."""
-    return Recording(factor * np.asarray(recording.time), recording.channels, recording.noise, recording.origin, recording.name)
+    return dataclasses.replace(recording, time=factor * np.asarray(recording.time))

@@ -18,7 +18,8 @@ BYSTANDERS = ("temperature", "command")  # recorded beside: they may stand still
 class Recording:
     """One run. `time`: s, uniform, (time,); `channels`: quantity -> SI values (time,); `noise`: rms if known.
 
-    Refuses NaN, non-uniform time and clipping with a `RecordingError` that says where and how to mend it.
+    Refuses NaN, non-uniform time and clipping with a `RecordingError` that says where and how to mend it. `judged`: whether clipping
+    was looked for in what was measured: what `dataclasses.replace` makes of a recording was not, and has crests of its own.
     """
 
     time: np.ndarray
@@ -26,6 +27,7 @@ class Recording:
     noise: dict = dataclasses.field(default_factory=dict)
     origin: dict = dataclasses.field(default_factory=dict)
     name: str = "recording"
+    judged: bool = dataclasses.field(default=False, repr=False, compare=False)
 
     def __post_init__(self):
         if len(self.time) < 16:
@@ -46,10 +48,11 @@ class Recording:
         if drive is not None:
             refuse_constant(self.name, self.drive, drive)
         # a loop given as points has no time, in which alone a crest has a shape
-        tested = () if self.origin.get("quasistatic") else self.channels.items()
+        tested = () if self.judged or self.origin.get("quasistatic") else self.channels.items()
         for channel, values in tested:
             if channel not in ("time", *BYSTANDERS):
                 refuse_clipping(self.name, channel, np.asarray(values, float), None if channel == self.drive else drive)
+        object.__setattr__(self, "judged", True)
 
     def _check_time(self):
         if not np.all(np.isfinite(self.time)):

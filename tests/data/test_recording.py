@@ -130,6 +130,17 @@ def test_the_fundamental_is_looked_for_once(monkeypatch):
     assert other.frequency() == pytest.approx(8) and len(asked) == 2
 
 
+def test_what_is_made_of_a_recording_is_not_judged_as_measured():
+    """A rod with play rests at its crests: read as sound, and refused as clipped once a slow drift had been taken out of it."""
+    time = np.arange(1000) * 1e-3
+    x = np.sin(2 * np.pi * 5 * time)
+    one = Recording(time, {"current": x, "displacement": np.cos(2 * np.pi * 5 * time)})
+    cut = {"current": x, "displacement": np.minimum(one.channels["displacement"], 0.7)}
+    with pytest.raises(RecordingError, match="clipped"):
+        Recording(time, cut)
+    assert dataclasses.replace(one, channels=cut).judged
+
+
 @pytest.mark.parametrize("orders", [(3, 7, 11, 13, 17, 19, 23, 27, 31, 33, 37), (3, 5, 8, 12, 17, 23, 30)], ids=len)
 def test_the_period_of_a_multisine_is_not_drawn_off_by_its_weaker_lines(orders):
     """With the five strongest of them alone it was 8e-5 off, which turns the 37th order by 4 degrees within four periods."""
