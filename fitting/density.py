@@ -16,10 +16,13 @@ from scipy.sparse import csc_array, csr_array, hstack, vstack
 
 from magjax.errors import ConfigurationError
 
+from .solver import bounded_minimum
+
 R_EXPONENT = 1.6
 TAIL = 0.5
 RIDGE = 0.3  # beside second differences
 SAME_PLANE = 0.02  # of a plane, by which its ends may move before what was found of its density is of another
+NEAREST = 1e-6  # of what a density weighs, that its penalties do where it is led over from another basis
 AT_ONCE = 100  # unknowns whose planes are in memory side by side
 
 
@@ -128,6 +131,26 @@ class DensityBasis:
         """The (L+2, L+2) mass array, A/m."""
         return (self.total * (self.cells @ np.asarray(x))).reshape(self.size, self.size)
 
+    def on_plane_of(self, other) -> bool:
+        """Whether its plane is nearly that of something else with a `low` and a `high`."""
+        return abs(self.low - other.low) + abs(self.high - other.high) < SAME_PLANE * (other.high - other.low)
+
+    def taking(self, x, other: "DensityBasis") -> np.ndarray | None:
+        """The unknowns whose masses come nearest, in least squares, to those that x makes on another basis; None of another plane.
+
+        What they leave open, as at the edges of the plane, is as smooth as the penalties ask for.
+        """
+        if not self.on_plane_of(other) or self.size != other.size:
+            return None
+        if (self.knots_s, self.knots_r, self.unknowns) == (other.knots_s, other.knots_r, other.unknowns):
+            return np.asarray(x)
+        normal = (self.cells.T @ self.cells).toarray()
+        light = NEAREST * np.trace(normal) / len(normal)
+        for D in self.penalties:
+            normal += light * (D.T @ D).toarray()
+        none = np.zeros(self.unknowns)
+        return bounded_minimum(normal, -(self.cells.T @ (other.cells @ np.asarray(x))), none, (none, none + np.inf))
+
 
 @functools.lru_cache(maxsize=2)
 def hat_basis(
@@ -220,9 +243,8 @@ class Stiffness:
 
     def fits(self, basis: DensityBasis) -> bool:
         """Whether it is of this density, on nearly this plane."""
-        near = abs(basis.low - self.low) + abs(basis.high - self.high) < SAME_PLANE * (self.high - self.low)
         rows = tuple(D.shape[0] for D in basis.penalties)
-        return near and self.knots == (basis.knots_s, basis.knots_r) and rows == tuple(len(f) for f in self.factors)
+        return basis.on_plane_of(self) and self.knots == (basis.knots_s, basis.knots_r) and rows == tuple(len(f) for f in self.factors)
 
     def of(self, penalties) -> tuple[csr_array, ...]:
         """The differences times the roots of their weights."""

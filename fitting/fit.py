@@ -118,14 +118,26 @@ def _changes_scale(bench, names, start) -> bool:
     return bench.drive == "field" and EDDY_EFFECT in names and EDDY_EFFECT not in start.problem.layout.names
 
 
-def _same_weights(problem, other) -> bool:
-    """Whether roughness weights of the one serve the other."""
-    return problem.layout.density_unknowns == other.layout.density_unknowns and problem.stiffness is other.stiffness
+def _weights(start, problem, choices) -> np.ndarray:
+    """Roughness weights to begin with: those of a fit to go on from, of its families where it is of other hats, of which they are
+    nearly the same; else those that all fits begin with."""
+    if start is None or (start.choices.knots is None) != (choices.knots is None):
+        return np.asarray(problem.target.weights)
+    before, same = start.problem.stiffness, start.problem.layout.density_unknowns == problem.layout.density_unknowns
+    if same and before is problem.stiffness:
+        return start.solution.weights
+    if choices.knots is None or problem.stiffness is not None:
+        return np.asarray(problem.target.weights)
+    return start.solution.weights if before is None else before.weights
 
 
 def _density(start):
-    """Density unknowns and bottom of a fit, None for None."""
-    return None if start is None else start.solution.z[: start.problem.layout.density_unknowns + 1]
+    """Basis, density unknowns and bottom of a fit, as `build_problem` goes on from; None for None."""
+    return None if start is None else _density_of(start.problem, start.solution)
+
+
+def _density_of(problem, solution):
+    return problem.basis, solution.z[: problem.layout.density_unknowns + 1]
 
 
 def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):
@@ -140,12 +152,10 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
 
         def one(say):
             known, z = build_problem(spectra, actuator, bench, names, tried, _density(start)) if posed is None else posed
-            same = start is not None and _same_weights(start.problem, known)
-            weights = start.solution.weights if same else np.asarray(known.target.weights)
             found = solve(
                 known,
                 z,
-                weights,
+                _weights(start, known, tried),
                 max_jacobians=choices.max_jacobians,
                 target=target,
                 progress=lambda k, c: say(f"fit from {rest}", k, c),
@@ -211,7 +221,6 @@ def _on_density(problem, solution, actuator, bench, names, finer, spectra, targe
     """The fit with a finer density, from where that with the coarser one ended, with steps where these take what it leaves:
     (problem, solution, its choices)."""
     found, z = _resample(problem, solution, spectra, actuator, bench, names, finer)
-    z = _with_parameters(found, z, problem, solution)
     of_families = solution.weights if problem.stiffness is None else problem.stiffness.weights
     weights = np.asarray(found.target.weights) if finer.knots is None else of_families  # of another basis
     say = functools.partial(report, "finer density")
@@ -226,18 +235,14 @@ def _on_density(problem, solution, actuator, bench, names, finer, spectra, targe
     return found, trial, finer
 
 
-def _with_parameters(new_problem, z, problem, solution):
-    z = z.copy()
-    for name in problem.layout.names:
-        value = float(problem.layout.value(name, jnp.asarray(solution.z)))
-        z[new_problem.layout.index(name)] = new_problem.layout.coordinate(name, value)
-    return z
-
-
 def _resample(problem, solution, spectra, actuator, bench, names, choices):
-    """A problem with a finer density, started from the fitted parameters and the equation error under them."""
+    """A problem with a finer density, started from what was fitted."""
     values = {n: float(problem.layout.value(n, jnp.asarray(solution.z))) for n in names}
-    return build_problem(spectra, actuator.replace(values), bench, names, choices)
+    found, z = build_problem(spectra, actuator.replace(values), bench, names, choices, _density_of(problem, solution))
+    for name, value in values.items():  # a start from the equation error has a scale of its own
+        z[found.layout.index(name)] = found.layout.coordinate(name, value)
+    z[len(z) - found.layout.memories :] = solution.z[len(solution.z) - problem.layout.memories :]
+    return found, z
 
 
 _actuator_at = eqx.filter_jit(lambda layout, template, z: layout.actuator(template, z))  # one program, not one an operation

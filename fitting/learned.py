@@ -100,7 +100,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
     choices = dataclasses.replace(base.choices, coarse=base.choices.fine) if max(term.counts) > ONE else base.choices
     for again in range(2):
         actuator = base.actuator.with_effect(term)
-        problem, z = build_problem(base.spectra, actuator, bench, names, choices, start[: n + 1])
+        problem, z = build_problem(base.spectra, actuator, bench, names, choices, (base.problem.basis, start[: n + 1]))
         z[len(z) - problem.layout.memories :] = start[len(start) - problem.layout.memories :]
         if again:
             z[n + 1 : n + 1 + len(names)] = moved  # noqa: F821

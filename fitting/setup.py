@@ -118,8 +118,8 @@ def with_held_masses(choices: Choices, bench, actuator) -> Choices:
 
 
 def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
-    """The problem and its starting vector. `start`: density unknowns and bottom to go on from, left aside where there are not as
-    many; else equation error."""
+    """The problem and its starting vector. `start`: a basis, and the density unknowns on it and bottom to go on from, left aside
+    where they are of another plane; else equation error."""
     if choices.periods < 2:
         raise ConfigurationError(f"periods = {choices.periods}: a steady state takes two at least, of which the last is read")
     low, high = applied_range(spectra, actuator)
@@ -140,6 +140,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         crowd = 1.7 if bench.drive == "field" else 1.0
         level = 2 * choices.level if known_field else choices.level
         basis = hat_basis(low - margin, high + margin, total, level, *choices.knots, crowd, bench.drive != "current")
+    start = None if start is None else _led_over(*start, basis)
     rest = field_of_rest(choices.rest, actuator, basis.low, basis.high)
     harmonics = min(choices.harmonics, max(len(s.reading) for s in spectra) - 1)
     full = [line_deviations(s, s.noise) for s in spectra]
@@ -156,7 +157,7 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         actuator = starter = actuator.replace({"piezo.chi": found})
     if held:
         start = np.asarray([(actuator.hysteresis.offset - actuator.hysteresis.masses.sum()) / total])
-    elif start is None or len(start) != basis.cells.shape[1] + 1:
+    elif start is None:
         x, bottom, _ = equation_error_start(basis, spectra, full, starter, rest=rest, touching=choices.touching)
         start = np.append(x, bottom)
     known = actuator.parameters()
@@ -188,6 +189,12 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
         target = eqx.tree_at(lambda t: t.weights, target, jnp.ones(len(basis.penalties)))
     problem = Problem(layout, template, predictors, target, tuple(spectra), basis, bench.quasistatic, stiffness)
     return problem, np.concatenate([start, [layout.coordinate(n, v) for n, v in zip(names, values, strict=True)], np.zeros(memories)])
+
+
+def _led_over(basis, found, new):
+    """Density unknowns and bottom on a new basis; None where it is of another plane."""
+    x = new.taking(found[: basis.unknowns], basis)
+    return None if x is None else np.append(x, found[basis.unknowns])
 
 
 def _padded(values, harmonics: int, missing: float):

@@ -397,6 +397,26 @@ def test_cells_of_many_are_the_same_density():
         cell_basis(-100.0, 900.0, 2.0, 24, 7)
 
 
+@pytest.mark.parametrize("finer", [lambda: hat_basis(-100.0, 900.0, 1.0, 60, 26, 18), lambda: cell_basis(-100.0, 900.0, 1.0, 60, 30)], ids=["hats", "cells"])
+def test_a_density_is_led_over_to_a_finer_basis(finer):
+    """From the equation error each finer density had begun far above where the coarser one ended; its masses are there already."""
+    basis, new = hat_basis(-100.0, 900.0, 1.0, 60, 14, 10), finer()
+    x = np.random.default_rng(5).random(basis.unknowns)
+    found = new.taking(x, basis)
+    off = np.abs(everett_values(new.masses(found)) - everett_values(basis.masses(x)))
+    assert off.max() < 0.01 * everett_values(basis.masses(x)).max() and found.min() >= 0
+    assert basis.taking(x, basis) is x or np.array_equal(basis.taking(x, basis), x)
+    assert new.taking(x, hat_basis(-100.0, 500.0, 1.0, 60, 14, 10)) is None  # of another plane
+    assert hat_basis(-100.0, 900.0, 1.0, 30, 14, 10).taking(x, basis) is None  # of other cells
+
+
+def test_a_finer_density_begins_where_the_coarser_one_ended(recordings, bench, result):
+    """After one Jacobian it is nearly as near, where one from the equation error is twice as far off."""
+    finer = dataclasses.replace(result.choices, knots=(26, 18), max_jacobians=1)
+    led, anew = (fit(recordings, bench, actuator=result.actuator, start=s, choices=finer, refine=False) for s in (result, None))
+    assert led.chi2_per_sample < 1.5 * result.chi2_per_sample < 0.75 * anew.chi2_per_sample
+
+
 def test_all_densities_share_their_programs():
     """What is compiled depends on the level of the plane alone, and that is one for all."""
     assert {row.get("level", Choices().level) for step in FINER for row in step} == {Choices().level}
