@@ -96,7 +96,7 @@ def refitted(task, current, best, good, excess, any_rest: bool = True, any_densi
         bare = on(found, knots=Choices().knots, cells=None)
         found = task.fit(best.result.actuator, choices=bare, spectra=best.result.spectra, refine=highest).choices
     elif any_density and finer_hats(chosen) and FINER_FROM[0] < left < highest:
-        found = task.fit(best.result.actuator, choices=found, spectra=best.result.spectra, refine=highest).choices
+        found = _density_beside(task, best.result, found, highest).choices
     elif any_density and left >= highest:
         for choices in hats_of_step(found, task.bench, 2):
             last = task.fit_on(best.result, best.result.actuator, choices=choices)
@@ -123,3 +123,12 @@ def refitted(task, current, best, good, excess, any_rest: bool = True, any_densi
         return best, good, before
     far = [t for t in good if t.name not in {a.name for a in again}]  # no rivals alone, but they may be beside a later effect
     return ended, [*again, *far], task
+
+
+def _density_beside(task, at_hand, choices, highest):
+    """The fit with a density chosen beside the effects of the one at hand: from scratch, for that has bent to what was missing; from
+    the one at hand where that ends above it."""
+    anew = task.fit(at_hand.actuator, choices=choices, spectra=at_hand.spectra, refine=highest)
+    if chi2_of(anew) < chi2_of(at_hand) + MIN_DROP:
+        return anew
+    return task.fit_on(at_hand, at_hand.actuator, choices=choices, refine=highest)

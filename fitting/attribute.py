@@ -32,6 +32,7 @@ DETAIL_SHARE = 0.3  # of the misfit that an effect takes where the details of it
 AT_NOISE = 0.92  # chi2/N at which a fit with nothing missing ends
 MISFIT = 1.3  # chi2/N from which the best is not the whole truth itself:
 ROUGH_CHI2 = 3.0  # chi2/N that a rough density may leave where nothing scores
+NO_CLEARER = 2.0  # times what the best leaves above the noise, that one which does the same to first order may leave beside a misfit
 MISFIT_TIE = 0.1  # rivals within this share of what it leaves are not told apart, growing from none where the noise is met
 
 
@@ -242,6 +243,8 @@ def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
             return f"what is left is a rough density's, and its BIC or AIC comes within {TIE:g} times that of the best's"
     elif behind < share * chi2_of(best.result):
         return f"the best leaves a misfit itself, and this is {behind:.0f} in chi2 behind it: less than {share:.1%} of that"
+    elif left > MISFIT and _same(t, best) and excess_of(t.result) < NO_CLEARER * excess_of(best.result):
+        return f"to first order it does the same to the reading, and beside a misfit that the best leaves too, it leaves {t.result.chi2_per_sample:.3g} in chi2/N"
     if behind < 2 * TIE and _same(t, best):
         return f"to first order it does the same to the reading, and its BIC or AIC comes within {2 * TIE:g} of the best's"
     return ""

@@ -29,12 +29,13 @@ from .screen import screened
 from .task import Late
 from .together import let_go
 from .trials import try_all
-from .verdict import FAR_FROM_NOISE, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
 
 MAX_EFFECTS = 3
 HOPELESS = 2.0  # times what a repair may leave, after two effects
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 BEYOND_PROMISE = 3.0  # times what it promises to first order, that an effect may take
+OF_FORM = 0.02  # the same of one that takes less than half of a misfit and leaves one
 WHOLE = 1.0, 0.9  # chi2/N and share of a misfit, at which what takes as little as FORM_ERROR is named: another law seldom has just their form
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 HIDES = 2.0  # chi2 per number of check recordings in units of what the fit expects to miss, from which a density may hide a feedback,
@@ -183,7 +184,9 @@ def _takes_too_little(state, best, excess) -> bool:
 
 def _makes_up_for_form(state, base, best) -> bool:
     """Whether a further effect takes as little as the form of the laws of those found leaves."""
-    return best.drop < FORM_ERROR * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best)
+    half = best.result.chi2_per_sample < MISFIT or best.explained_share > HALF
+    least = FORM_ERROR if half else OF_FORM
+    return best.drop < least * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best)
 
 
 def _not_confirmed(state, best, excess, check) -> bool:

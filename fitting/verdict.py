@@ -28,6 +28,8 @@ DOMINANT = (
 )  # share of a misfit from which an effect is named though it leaves some, if others leave so many times as much
 PROMISES = 8.0  # times the Newton decrement, that going on with a fit may gain at most
 DOMINANT_TEXT = " What is left is the form of its law, or something weaker beside it: no other effect takes nearly as much."
+LED_TEXT = " What is left is the form of their laws, or something weaker beside them: no other effect takes nearly as much as {}."
+FOLLOWS = 0.7, 0.5  # share of what the dominant effect leaves, that those after it must take, and of its check recordings' misfit, to which they must lower that
 CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they confirm may leave, or so much a recording
 NO_BETTER = (3.0, 10.0, 0.8)  # chi2/N and check recordings' misfit from which what explains the one must lower the other to this share
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording, that a repair may leave
@@ -82,10 +84,14 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     foretold = before > WELL_FORETOLD[0] * len(rows) and after < WELL_FORETOLD[1] * before
     full = FULL_SHARE if evidence.excess < CLEAN_CHI2 or foretold else FULLER_SHARE
     alone = dominant(evidence)
-    full = min(full, DOMINANT[0]) if alone else full
+    full, led = min(full, DOMINANT[0]) if alone else full, ""
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         first = first_alone(evidence)
-        return verdict(first) if first is not None else _unknown(evidence, common)
+        if first is None:
+            return _unknown(evidence, common)
+        if not followed(evidence, first, after):
+            return verdict(first)
+        led = LED_TEXT.format(steps[0][0].name)
     worse = after > WORSE[0] * before + WORSE[1] * len(rows)
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     hardly = far_off and after > NO_BETTER[2] * before
@@ -113,7 +119,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
             form += BEHIND_TEXT.format(slow) if slow else ZEROS_TEXT.format(effect.amplitude)
         elif (slow := creeps_on(effect, evidence)) and CREEPS_TEXT.format(slow) not in form:
             form += CREEPS_TEXT.format(slow)
-    form += DOMINANT_TEXT if alone and evidence.missing and not rough else ""
+    form += led or (DOMINANT_TEXT if alone and evidence.missing and not rough else "")
     for best, _, _, previous in steps:
         if best.name in evidence.reached.hidden:
             form += HIDDEN_TEXT.format(best.name, best.drop, evidence.reached.foretell.says_for(best.result, previous))
@@ -174,6 +180,21 @@ def first_alone(evidence) -> Evidence | None:
     reached = dataclasses.replace(evidence.reached, current=steps[0][0].result, steps=steps[:1], form=None)
     first = dataclasses.replace(evidence, reached=reached)
     return first if dominant(first) and first.share >= DOMINANT[0] and first.excess < FAR_FROM_NOISE else None
+
+
+def followed(evidence, first, after: float) -> bool:
+    """Whether those after the dominant effect, `first`, take most of what it leaves, and the check recordings show it: then they are
+    named beside it though the forms of their laws leave a misfit. `after`: the check recordings' misfit with all of them."""
+    raw, clean = evidence.checks
+    if not raw or chi2_excess(evidence) > (1 - FOLLOWS[0]) * chi2_excess(first):
+        return False
+    rows = check_errors(evidence.raw.actuator, first.reached.current.actuator, raw, evidence.bench, clean)
+    return bool(after < FOLLOWS[1] * misfit(rows, "rms_after"))
+
+
+def chi2_excess(evidence) -> float:
+    """What was reached leaves above the noise, in chi2/N."""
+    return evidence.excess - NULL_CHI2
 
 
 def unconfirmed(reached):
