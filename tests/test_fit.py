@@ -182,6 +182,7 @@ def test_what_a_density_is_made_of_is_told(result):
     assert in_words(Choices(knots=None, cells=30)).startswith("masses of cells, 30 ") and "held" in in_words(Choices(knots=None, rest="held"))
 
 
+@pytest.mark.long
 def test_what_physics_leaves_no_steps_take(bench, recordings):
     """Of a reading that lags no density makes anything, rough or not."""
     late = [dataclasses.replace(r, channels={**r.channels, "displacement": lagging(r)}) for r in recordings]
