@@ -24,6 +24,7 @@ from .uncertainty import covariance
 
 SURE = 0.9
 PERIODS = 4
+CENTRED = 1e-4  # of the range of the drives, an offset that is none
 SHUNT = "the coil's current by a shunt beside its command"
 CALIBRATION = "a calibration of the sensor (its reading of a known displacement; a mass added, which moves the rod's resonance alone, tells too)"
 PICK_UP = "a calibration of the pick-up's channel (its reading of a known emf at the drive's frequencies)"
@@ -104,11 +105,13 @@ def menu(spectra, bench) -> list[tuple[float, float, float]]:
     low, high = min(d.min() for d in drives), max(d.max() for d in drives)
     limit = float(bench.limit or np.inf)
     low, high = max(low, -limit), min(high, limit)
+    middle = 0.5 * (high + low)
+    middle = middle if abs(middle) > CENTRED * (high - low) else 0.0  # of a drive about zero its converter's counts leave a rest
     seen = np.array([s.frequency for s in spectra])
     frequencies = {0.5 * seen.min(), np.sqrt(seen.min() * seen.max()), seen.max(), 1.5 * seen.max(), 2 * seen.max()}
     if bench.quasistatic:
         frequencies = {seen[0]}
-    return [(f, share * 0.5 * (high - low), 0.5 * (high + low)) for f in sorted(frequencies) for share in (0.98, 0.5)]
+    return [(f, share * 0.5 * (high - low), middle) for f in sorted(frequencies) for share in (0.98, 0.5)]
 
 
 def separations(trials, drives, spectra):

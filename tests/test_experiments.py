@@ -42,6 +42,14 @@ def test_the_menu_stays_within_what_was_visited():
     assert all(offset + A <= 0.9 and offset - A >= -0.7001 for _, A, offset in drives)
 
 
+def test_a_drive_about_zero_is_asked_for_without_the_rest_that_counts_leave():
+    """A page had asked for an offset of 4.69e-10 A."""
+    swings = [SimpleNamespace(frequency=10.0, drive_at=lambda phases: 0.8 * np.sin(2 * np.pi * phases) + 4.7e-10)]
+    assert {offset for *_, offset in menu(swings, load_bench("aa-050h"))} == {0.0}
+    swings = [SimpleNamespace(frequency=10.0, drive_at=lambda phases: 0.5 * np.sin(2 * np.pi * phases) + 0.01)]
+    assert all(offset == pytest.approx(0.01) for *_, offset in menu(swings, load_bench("aa-050h")))
+
+
 def known(r, J=None, C=None):
     r = np.asarray(r, float)
     return r, np.zeros((*r.shape, 1)) if J is None else J, np.eye(1) if C is None else C
