@@ -123,12 +123,16 @@ def _weights(start, problem, choices) -> np.ndarray:
     nearly the same; else those that all fits begin with."""
     if start is None or (start.choices.knots is None) != (choices.knots is None):
         return np.asarray(problem.target.weights)
-    before, same = start.problem.stiffness, start.problem.layout.density_unknowns == problem.layout.density_unknowns
-    if same and before is problem.stiffness:
+    if start.problem.layout.density_unknowns == problem.layout.density_unknowns and start.problem.stiffness is problem.stiffness:
         return start.solution.weights
     if choices.knots is None or problem.stiffness is not None:
         return np.asarray(problem.target.weights)
-    return start.solution.weights if before is None else before.weights
+    return _of_families(start.problem, start.solution)
+
+
+def _of_families(problem, solution) -> np.ndarray:
+    """Roughness weights of the families of differences, where these have weights of their own, too."""
+    return solution.weights if problem.stiffness is None else problem.stiffness.weights
 
 
 def _density(start):
@@ -221,8 +225,7 @@ def _on_density(problem, solution, actuator, bench, names, finer, spectra, targe
     """The fit with a finer density, from where that with the coarser one ended, with steps where these take what it leaves:
     (problem, solution, its choices)."""
     found, z = _resample(problem, solution, spectra, actuator, bench, names, finer)
-    of_families = solution.weights if problem.stiffness is None else problem.stiffness.weights
-    weights = np.asarray(found.target.weights) if finer.knots is None else of_families  # of another basis
+    weights = np.asarray(found.target.weights) if finer.knots is None else _of_families(problem, solution)  # of another basis
     say = functools.partial(report, "finer density")
     steps = has_steps(finer, bench)
     useful = solution.chi2 + max(solution.chi2 - problem.data_count, 0.0) if steps else target  # steps may yet take it

@@ -186,15 +186,10 @@ def followed(evidence, first, after: float) -> bool:
     """Whether those after the dominant effect, `first`, take most of what it leaves, and the check recordings show it: then they are
     named beside it though the forms of their laws leave a misfit. `after`: the check recordings' misfit with all of them."""
     raw, clean = evidence.checks
-    if not raw or chi2_excess(evidence) > (1 - FOLLOWS[0]) * chi2_excess(first):
+    if not raw or evidence.excess - NULL_CHI2 > (1 - FOLLOWS[0]) * (first.excess - NULL_CHI2):
         return False
     rows = check_errors(evidence.raw.actuator, first.reached.current.actuator, raw, evidence.bench, clean)
     return bool(after < FOLLOWS[1] * misfit(rows, "rms_after"))
-
-
-def chi2_excess(evidence) -> float:
-    """What was reached leaves above the noise, in chi2/N."""
-    return evidence.excess - NULL_CHI2
 
 
 def unconfirmed(reached):
