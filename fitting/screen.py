@@ -252,5 +252,5 @@ def screened(result, choices) -> list:
         raise KeyboardInterrupt
     found = [c for c in screen(result.problem, result.refined) if c.name not in choices.without]
     found = [c for c in found if c.name in choices.only] if choices.only else found
-    let_go()  # a program an effect, of a density and of other effects that seldom come again
+    let_go(result.actuator)  # a program an effect, of a density and of other effects that seldom come again
     return found

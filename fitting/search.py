@@ -149,7 +149,7 @@ def _forward(task, base, state, candidates, check, ends, free_means):
         candidates = left if found.result is best.result else screened(found.result, task.choices)
         state.adopt(found, good)
         state.hidden += (found.name,) if hidden else ()
-        let_go()
+        let_go(found.result.actuator)
         if ends(state.current):
             return task, made_up, True
     return task, made_up, False

@@ -10,6 +10,7 @@ import threading
 
 import jax
 
+from magjax.effects.base import AbstractEffect
 from magjax.programs import forget, trim
 
 SIDE_BY_SIDE = 2
@@ -86,9 +87,11 @@ class _Turns:
             self.turn += 1
 
 
-def let_go() -> None:
-    """Give back the memory of compiled programs that are not needed again: some hundred megabytes each."""
-    forget()
+def let_go(*actuators) -> None:
+    """Give back the memory of compiled programs that are not needed again, some hundred megabytes each: of all but those that know
+    no other effects than one of the `actuators` has."""
+    sets = [{type(e) for e in a.effects} for a in actuators]
+    forget(lambda kinds: any({k for k in kinds if issubclass(k, AbstractEffect)} <= own for own in sets))
     jax.clear_caches()
     gc.collect()
     trim()

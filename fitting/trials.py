@@ -59,7 +59,8 @@ def try_all(task, current, top, candidates, excess, under_way) -> list[Trial]:
                 under_way.pop(c.name, None)
         first = [t for t in first if t is not None]
         trials.extend(together([ended(t, useful(*(f for f in first if f is not t))) for t in first], task.progress))
-        let_go()
+        nearest = min(trials, key=lambda t: finite_chi2(t.result), default=None)
+        let_go(current.actuator, *([nearest.result.actuator] if nearest else []))
 
     least = WORTH * abs(top[0].z)
     while top:

@@ -56,7 +56,7 @@ def kept(function):
                 program = known.get(key)
                 if program is None:
                     program = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
-                    with COMPILING if getattr(program, "heavy", False) else contextlib.nullcontext():
+                    with COMPILING if program and program.heavy else contextlib.nullcontext():
                         found = program(leaves) if program else alone()(*arguments)
                     trim()
                     known[key] = program
@@ -76,10 +76,12 @@ def compiler_options() -> dict:
     return COMPILER
 
 
-def forget() -> None:
-    """Drop all programs from memory; they are read again where they are asked for."""
+def forget(kept=lambda kinds: False) -> None:
+    """Drop programs from memory, but those for whose classes of modules `kept` speaks; they are read again where they are asked for."""
     for known in IN_MEMORY:
-        known.clear()
+        for key, program in tuple(known.items()):
+            if not (program and kept(program.kinds)):
+                known.pop(key, None)
 
 
 def trim() -> None:
@@ -92,10 +94,10 @@ def trim() -> None:
 
 def _program(function, arguments, constants, key, leaves, folder):
     """The program as a function of the leaves, read or traced; False where it cannot be kept."""
-    modules = set()
-    jax.tree.flatten(arguments, is_leaf=lambda x: isinstance(x, eqx.Module) and modules.add(_home(type(x))))
+    kinds = set()
+    jax.tree.flatten(arguments, is_leaf=lambda x: isinstance(x, eqx.Module) and kinds.add(type(x)))
     said = f"{function.__module__}.{function.__qualname__} {key} {jax.default_backend()} {jax.config.jax_enable_x64} {_versions()}"
-    if not modules <= set(OWN) or " at 0x" in said:
+    if not {_home(kind) for kind in kinds} <= set(OWN) or " at 0x" in said:
         return False
     path = folder / f"{hashlib.sha256(said.encode()).hexdigest()}.program"
     try:
@@ -107,16 +109,29 @@ def _program(function, arguments, constants, key, leaves, folder):
         except Exception:  # something in it has no lasting form
             return False
         _write(path, lasting)
-    # on one device whatever the arguments come from: else each mixture of new arrays and results is compiled anew
-    device = jax.config.jax_default_device or jax.local_devices()[0]
-    run = jax.jit(exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device), compiler_options=compiler_options())
+    return _Program(form, exported, frozenset(kinds))
 
-    def program(leaves):
+
+class _Program:
+    """A program as a function of the leaves, compiled where it is first called; it holds what was compiled by itself, and so
+    outlives `jax.clear_caches`.
+
+    `kinds`: the classes of modules among its arguments; `heavy`: whether to compile it takes much memory.
+    """
+
+    def __init__(self, form, exported, kinds):
+        self.form, self.exported, self.kinds = form, exported, kinds
+        self.heavy, self.run = len(exported.mlir_module_serialized) > HEAVY, None
+
+    def __call__(self, leaves):
+        if self.run is None:
+            # on one device whatever the arguments come from: else each mixture of new arrays and results is compiled anew
+            device = jax.config.jax_default_device or jax.local_devices()[0]
+            lazy = jax.jit(self.exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device), compiler_options=compiler_options())
+            self.run = lazy.lower(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)).compile()
+            self.exported = None
         with jax.ensure_compile_time_eval():  # also where another program is traced meanwhile, for which this is a constant
-            return _filled(form, jax.tree.leaves(run(*leaves)))
-
-    program.heavy = len(exported.mlir_module_serialized) > HEAVY
-    return program
+            return _filled(self.form, jax.tree.leaves(self.run(*leaves)))
 
 
 def _traced(function, constants, tree, leaves):

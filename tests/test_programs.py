@@ -105,6 +105,24 @@ def test_it_is_compiled_once(folder):
     assert all(np.allclose(one, 2.0 * np.asarray(values[k % 3]) * 0.5) for k, one in enumerate(together))
 
 
+def test_what_is_spoken_for_stays_compiled_when_the_rest_is_dropped(folder):
+    compiled, line, values = [], Timeline(jnp.asarray(0.5), 6, True), np.arange(6.0)
+
+    def count(event, seconds, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(seconds)
+
+    scaled(line, values, 2.0)
+    jax.monitoring.register_event_duration_secs_listener(count)
+    forget(lambda kinds: kinds == {Timeline})
+    jax.clear_caches()
+    assert np.allclose(scaled(line, values, 2.0)[0][0], values) and not compiled
+    forget(lambda kinds: Timeline not in kinds)
+    jax.clear_caches()
+    scaled(line, values, 2.0)
+    assert len(compiled) == 1 and TRACED == [2.0]
+
+
 def test_files_that_changed_and_programs_that_were_spoiled_are_made_anew(folder, monkeypatch):
     line, values = Timeline(jnp.asarray(0.5), 6, True), jnp.arange(6.0)
     scaled(line, values, 2.0)
@@ -156,7 +174,7 @@ def test_heavy_programs_are_compiled_one_at_a_time(monkeypatch, folder, heavy, a
             busy.pop()
             return leaves
 
-        run.heavy = heavy
+        run.heavy, run.kinds = heavy, frozenset()
         return run
 
     monkeypatch.setattr(programs, "_program", slow)
