@@ -17,6 +17,8 @@ if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):  # a compiler th
 import jax
 import pytest
 
+from magjax.programs import forget
+
 jax.config.update("jax_enable_x64", True)
 # for the commands that tests start, too
 cache = Path(os.environ.setdefault("MAGJAX_CACHE", str(Path(tempfile.gettempdir()) / "magjax-test-cache")))
@@ -49,7 +51,7 @@ def ranks(request):
         yield
 
 
-HASTY = {"test_columns", "test_effects", "test_learned", "test_passes", "test_shells", "test_simulate", "test_start_memory"}
+HASTY = {"test_drift", "test_heat", "test_foretold", "test_hum", "test_columns", "test_effects", "test_learned", "test_passes", "test_shells", "test_simulate", "test_start_memory"}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -64,6 +66,7 @@ def hasty_compiler(request):
 def release_programs():
     """Compiled programs of a module are dropped after it: each holds many memory mappings."""
     yield
+    forget()
     jax.clear_caches()
 
 

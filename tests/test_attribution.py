@@ -41,7 +41,8 @@ def candidate(name, z, direction=(1.0, 0.0, 0.0), visibility=0.1):
 def trial(name, chi2n, parameters=1, base=3.0, physical=True, direction=(1.0, 0.0, 0.0)):
     """A fit that ended at chi2/N."""
     drop = (base - chi2n) * COUNT
-    result = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, converged=True, choices=Choices())
+    bare = SimpleNamespace(effects=())
+    result = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, converged=True, choices=Choices(), actuator=bare)
     return Trial(
         candidate(name, 20.0, direction),
         result,
@@ -948,7 +949,7 @@ def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, leader
     monkeypatch.setattr(fitting.trials, "try_effect", fitted)
     monkeypatch.setattr(fitting.trials, "settled", lambda task, current, t, excess, target: t)
     task = Task((), None, progress=lambda *a: None)
-    current = SimpleNamespace(chi2_per_sample=100.0, data_count=COUNT)
+    current = trial("none", 100.0).result
     assert names(fitting.trials.try_all(task, current, rows[:1], rows, 99.0 * COUNT, {})) == tried
 
 
@@ -961,7 +962,7 @@ def test_a_feedback_that_scores_is_tried_though_another_meets_the_noise(monkeypa
     monkeypatch.setattr(fitting.trials, "try_effect", fitted)
     monkeypatch.setattr(fitting.trials, "settled", lambda task, current, t, excess, target: t)
     monkeypatch.setattr(fitting.trials, "in_detail", lambda task, base, t, excess: t)
-    current = SimpleNamespace(chi2_per_sample=1.3, data_count=COUNT)
+    current = trial("none", 1.3).result
     found = fitting.trials.try_all(Task((), None, progress=lambda *a: None), current, leaders(rows), rows, 0.38 * COUNT, {})
     assert ("stress_feedback" in names(found)) is tried
 

@@ -152,13 +152,13 @@ def test_a_drift_of_one_record_alone_is_taken_out_of_it_and_told():
 
 
 @pytest.mark.parametrize("frequencies", [FREQUENCIES, (10.0, 300.0, 400.0, 500.0)], ids=["shown by most", "shown by the long one"])
-@pytest.mark.parametrize("rate", [0.0, 1e-6, 2e-5])
+@pytest.mark.parametrize("rate", [pytest.param(0.0, marks=pytest.mark.long), 1e-6, 2e-5])
 def test_what_the_others_may_share_is_no_drift_of_one(frequencies, rate):
     runs = records(lambda t: rate * t, frequencies)
     assert drifts_of_one(runs, spectra_of(runs, BENCH), BENCH) == (runs, [])
 
 
-@pytest.mark.parametrize("drifting", [False, True], ids=["none drifts", "one drifts"])
+@pytest.mark.parametrize("drifting", [pytest.param(False, marks=pytest.mark.long), True], ids=["none drifts", "one drifts"])
 def test_hum_in_short_records_is_no_drift_of_one(drifting):
     """A short record sees less than a period of the hum, which the longer ones show whole."""
     phases = np.random.default_rng(2).uniform(0, 2 * np.pi, 9).tolist()

@@ -46,6 +46,7 @@ def test_declares_what_the_documentation_needs(kind):
     assert kind.__doc__ and kind.__module__.endswith(kind.name)
 
 
+@pytest.mark.long
 def test_at_their_nulls_all_of_them_together_change_nothing():
     act, base = actuator(20), np.asarray(reading(actuator(20)))
     for kind in CATALOGUE:

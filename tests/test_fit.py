@@ -162,6 +162,7 @@ def test_a_density_with_steps_is_met_and_foretells(bench):
     assert row["rms_after"] < row["rms_before"]
 
 
+@pytest.mark.long
 def test_cells_that_were_chosen_get_steps(bench, monkeypatch):
     """One roughness weight a family is as wrong of cells as of hats."""
     monkeypatch.setattr("fitting.finer.FINER", ((), CELLS[:1], ()))

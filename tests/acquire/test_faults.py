@@ -76,7 +76,10 @@ def test_clean_run_over_a_pty_and_tcp(emulate, order):
 
 @pytest.mark.parametrize(
     "faults",
-    [("drop=2e-5",), ("flip=2e-5",), ("merge=0.02", "duplicate=0.05"), ("zeros=200000",), ("drop=3e-5", "flip=3e-5", "merge=0.01")],
+    [
+        *(pytest.param(one, marks=pytest.mark.long) for one in (("drop=2e-5",), ("flip=2e-5",))),
+        ("merge=0.02", "duplicate=0.05"), ("zeros=200000",), ("drop=3e-5", "flip=3e-5", "merge=0.01"),
+    ],
 )
 def test_damage_on_the_line_is_counted_exactly(emulate, order, faults):
     words = [w for f in faults for w in ("--fault", f)]
