@@ -11,7 +11,7 @@ import numpy as np
 from magjax.chain import Timeline
 from magjax.chain.coupled import disturbance_of
 from magjax.chain.march import magnetize
-from magjax.programs import kept
+from magjax.programs import seldom
 from magjax.simulate import driven_current, finish_chain
 
 
@@ -25,7 +25,7 @@ def bare(actuator):
     return dataclasses.replace(actuator, effects=())
 
 
-@kept
+@seldom
 def trajectory(predictor, actuator):
     """The march of every recording, per grid: (field, magnetization, its spread) of the last period, (recordings, samples), and (relay field,
     magnetization, coil current, step) of all periods, (recordings, time)."""
@@ -44,7 +44,7 @@ def trajectory(predictor, actuator):
     return [row[0] for row in rows], [row[1] for row in rows]
 
 
-@kept
+@seldom
 def in_step_change(effect, predictor, actuator, path, finite: bool):
     """What an effect adds to every step along a `trajectory`, 3 of (recordings, time) per grid: its derivative at null, or, `finite`,
     all of it."""
@@ -60,7 +60,7 @@ def in_step_change(effect, predictor, actuator, path, finite: bool):
     return tuple(jax.vmap(one)(*part) for part in path)
 
 
-@kept
+@seldom
 def drive_change(effect, predictor, actuator):
     """d drive / d amplitude of a source effect at null, per grid, (recordings, samples)."""
 
@@ -71,7 +71,7 @@ def drive_change(effect, predictor, actuator):
     return tuple(jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True))
 
 
-@kept
+@seldom
 def signals_of(predictor, actuator, fields):
     """Every signal of the last period of every recording from its `fields`, per grid: `Signals` of (recordings, samples)."""
 
@@ -88,7 +88,7 @@ def lines_of(predictor, signals) -> np.ndarray:
     return np.concatenate(rows)[np.asarray(predictor.index)]
 
 
-@kept
+@seldom
 def late_change(effects, predictor, actuator, signals):
     """d (free displacement, displacement, reading) / d amplitude of an effect behind the hysteresis at null, where it acts, per grid,
     (shapes, recordings, samples) each. `effects`: one with its shapes stacked; `signals`: of `signals_of`."""

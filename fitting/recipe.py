@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.errors import ConfigurationError
-from magjax.programs import kept
+from magjax.programs import seldom
 from magjax.simulate import run_chain
 
 from .spectra import reduce_recording
@@ -57,7 +57,7 @@ def recipe_beside(result, recordings) -> LagTable:
     return lag_recipe(tones, result.actuator, float(result.actuator.coil.R_eddy) * MESH)
 
 
-@kept
+@seldom
 def _square_lags(actuator, drives, steps, resistances):
     """Phase of the fundamental of M^2 against the drive's, rad: (resistances, recordings)."""
 

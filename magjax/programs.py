@@ -30,13 +30,17 @@ OWN = ("magjax", "fitting")
 IN_MEMORY: list[dict] = []  # the programs of every function
 COMPILING = threading.RLock()  # one heavy program at a time: to compile it takes up to a gigabyte
 COMPILER = {"xla_cpu_use_fusion_emitters": False}  # with them a program takes twice as long to compile, and runs no faster
+HASTY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # a third of the time to compile
 HEAVY = 77_000  # bytes of what is compiled, more than the plain chain's programs have
 
 
-def kept(function):
-    """As `equinox.filter_jit`, for a function of modules, arrays and constants that returns arrays in tuples, lists, dicts and modules."""
+def kept(function, hasty: bool = False):
+    """As `equinox.filter_jit`, for a function of modules, arrays and constants that returns arrays in tuples, lists, dicts and modules.
+
+    `hasty`: compiled without optimizing, for what runs a few times.
+    """
     within, known, locks = eqx.filter_jit(function), {}, {}
-    alone = functools.cache(lambda: eqx.filter_jit(function, compiler_options=compiler_options()))
+    alone = functools.cache(lambda: eqx.filter_jit(function, compiler_options=compiler_options(hasty)))
     IN_MEMORY.append(known)
 
     @functools.wraps(function)
@@ -55,7 +59,7 @@ def kept(function):
             with locks.setdefault(key, threading.Lock()):  # a second thread waits until it is compiled
                 program = known.get(key)
                 if program is None:
-                    program = _program(function, arguments, constants, key, leaves, Path(folder) / "programs")
+                    program = _program(function, arguments, constants, key, leaves, Path(folder) / "programs", hasty)
                     with COMPILING if program and program.heavy else contextlib.nullcontext():
                         found = program(leaves) if program else alone()(*arguments)
                     trim()
@@ -66,14 +70,18 @@ def kept(function):
     return call
 
 
+seldom = functools.partial(kept, hasty=True)
+
+
 @functools.cache
-def compiler_options() -> dict:
-    """`COMPILER`, or nothing where this machine's compiler does not know them."""
-    try:
-        jax.jit(lambda x: x, compiler_options=COMPILER).lower(0.0).compile()
-    except Exception:
-        return {}
-    return COMPILER
+def compiler_options(hasty: bool = False) -> dict:
+    """`COMPILER`, with `HASTY` where asked for, as far as this machine's compiler knows them."""
+    known = {}
+    for options in (COMPILER, HASTY) if hasty else (COMPILER,):
+        with contextlib.suppress(Exception):
+            jax.jit(lambda x: x, compiler_options=options).lower(0.0).compile()
+            known |= options
+    return known
 
 
 def forget(kept=lambda kinds: False) -> None:
@@ -92,7 +100,7 @@ def trim() -> None:
             trimmed(0)
 
 
-def _program(function, arguments, constants, key, leaves, folder):
+def _program(function, arguments, constants, key, leaves, folder, hasty):
     """The program as a function of the leaves, read or traced; False where it cannot be kept."""
     kinds = set()
     jax.tree.flatten(arguments, is_leaf=lambda x: isinstance(x, eqx.Module) and kinds.add(type(x)))
@@ -109,7 +117,7 @@ def _program(function, arguments, constants, key, leaves, folder):
         except Exception:  # something in it has no lasting form
             return False
         _write(path, lasting)
-    return _Program(form, exported, frozenset(kinds))
+    return _Program(form, exported, frozenset(kinds), compiler_options(hasty))
 
 
 class _Program:
@@ -119,15 +127,15 @@ class _Program:
     `kinds`: the classes of modules among its arguments; `heavy`: whether to compile it takes much memory.
     """
 
-    def __init__(self, form, exported, kinds):
-        self.form, self.exported, self.kinds = form, exported, kinds
+    def __init__(self, form, exported, kinds, options):
+        self.form, self.exported, self.kinds, self.options = form, exported, kinds, options
         self.heavy, self.run = len(exported.mlir_module_serialized) > HEAVY, None
 
     def __call__(self, leaves):
         if self.run is None:
             # on one device whatever the arguments come from: else each mixture of new arrays and results is compiled anew
             device = jax.config.jax_default_device or jax.local_devices()[0]
-            lazy = jax.jit(self.exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device), compiler_options=compiler_options())
+            lazy = jax.jit(self.exported.call, in_shardings=jax.sharding.SingleDeviceSharding(device), compiler_options=self.options)
             self.run = lazy.lower(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)).compile()
             self.exported = None
         with jax.ensure_compile_time_eval():  # also where another program is traced meanwhile, for which this is a constant
