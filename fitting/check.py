@@ -9,7 +9,8 @@ from magjax.simulate import simulate
 from .model import Predictor, predicted_lines
 from .spectra import evaluate_lines, hum_part, reduce_recording
 
-SAMPLES, HARMONICS, PERIODS = 500, 40, 4  # of a prediction: points a period, lines, periods simulated
+SAMPLES, HARMONICS = 500, 40  # of a prediction: points a period, lines
+UNTIL = (1e-4, 60)  # periods simulated: until two differ by less, of their peak to peak, and at most
 WIDE = 160  # lines of one of a drive of many lines, such as a multisine, whose reading has more than HARMONICS
 MANY, TELLS = 5, 0.9  # order of a drive's last line from which it may be one, and share of what is between the lines that more must leave
 
@@ -32,7 +33,8 @@ def predicted_periods(actuator, spectra) -> list:
             continue
         chosen = [spectra[k] for k in some]
         turns = max(nesting(np.tile(s.drive_at(np.arange(800) / 800), 2)) for s in chosen)
-        predictor = Predictor.build(chosen, SAMPLES, WIDE if many else HARMONICS, PERIODS, int(4 * np.ceil(turns / 4)), apart=False)
+        wide, corners = WIDE if many else HARMONICS, int(4 * np.ceil(turns / 4))
+        predictor = Predictor.build(chosen, SAMPLES, wide, 0, corners, apart=False, until=UNTIL)
         lines = np.concatenate([np.asarray(predicted_lines(part, actuator))[: len(places)] for part, places in predictor.batches()])
         found |= dict(zip(some, lines[np.asarray(predictor.index)], strict=True))
     return [found[k] for k in range(len(spectra))]

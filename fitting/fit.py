@@ -39,12 +39,14 @@ from .outcome import (
     valleys,
 )
 from .result import FitResult, Quoted
+from .settling import periods_asked
 from .setup import EDDY_EFFECT, Choices, build_problem, free_parameters, spectra_of, with_held_masses
 from .steps import stepped
 from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 ASTRAY = 1e3  # chi2/N from which the signs of M in the loops that a fit began with are in doubt
+BRIEF = 5  # Jacobians that come near enough to tell how long a fit takes to settle
 
 
 def fit(
@@ -92,8 +94,14 @@ def fit(
     )
     compiled(problem, z)
     warm = time.perf_counter() - begin
-    asked = choices
-    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, asked, spectra, start, report, target)
+    asked, at = choices, z
+    while True:
+        if start is None:
+            problem, z, asked = _long_enough(problem, z, at, actuator, bench, names, asked, spectra, report)
+        problem, solution, choices = _start_memories(problem, z, actuator, bench, names, asked, spectra, start, report, target)
+        if start is not None or solution.interrupted or periods_asked(problem, solution.z) == asked.periods:
+            break
+        at = solution.z
     if start is None and solution.chi2 > ASTRAY * problem.data_count and not solution.interrupted:
         found = _with_turning(z, solution, actuator, bench, names, asked, spectra, report, target)
         problem, solution, choices = found or (problem, solution, choices)
@@ -176,6 +184,21 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
             known, found, tried = ended[0]
             ended = [(known, dataclasses.replace(found, converged=False, interrupted=True), tried)]
     return best_memory([row for row in ended if row[2].rest not in others or settled(*row[:2])])
+
+
+def _long_enough(problem, z, at, actuator, bench, names, choices, spectra, report):
+    """The problem, its start and choices with as many periods as it takes until they repeat: at first at z = `at`, then where a few
+    Jacobians from the first start memory lead."""
+    while (periods := periods_asked(problem, at)) != choices.periods:
+        choices = dataclasses.replace(choices, periods=periods)
+        first = dataclasses.replace(choices, rest=rests_of(bench, choices)[0][0])
+        problem, z = build_problem(spectra, actuator, bench, names, first)
+        say = functools.partial(report, f"until {periods} periods repeat")
+        brief = solve(problem, z, _weights(None, problem, first), max_jacobians=BRIEF, progress=say)
+        if brief.interrupted:
+            raise KeyboardInterrupt
+        at = brief.z
+    return problem, z, choices
 
 
 def _with_turning(z, solution, actuator, bench, names, choices, spectra, report, target):

@@ -171,15 +171,17 @@ class Predictor(eqx.Module):
     harmonics: int = eqx.field(static=True)
     periods: int = eqx.field(static=True)
     corners: int = eqx.field(static=True)
+    until: tuple[float, int] | None = eqx.field(static=True, default=None)
 
     @staticmethod
-    def build(spectra, samples: int, harmonics: int, periods: int, corners: int, apart: bool = True) -> "Predictor":
-        """For spectra on grids of `samples` points a period of the fastest strong line; not `apart`: one program for all of them."""
+    def build(spectra, samples: int, harmonics: int, periods: int, corners: int, apart: bool = True, until=None) -> "Predictor":
+        """For spectra on grids of `samples` points a period of the fastest strong line; not `apart`: one program for all of them.
+        `until`: (tolerance, most) instead of `periods`, see `run_chain`."""
         grids = period_grids(spectra, samples, apart)
         order = np.argsort(np.concatenate([g.index for g in grids]))
         return Predictor(
             tuple(on_device(g.drive) for g in grids), tuple(on_device(g.dt) for g in grids),
-            tuple(int(k) for k in order), harmonics, periods, corners,
+            tuple(int(k) for k in order), harmonics, periods, corners, until,
         )  # fmt: skip
 
     def __call__(self, actuator, levels=None):
@@ -195,7 +197,7 @@ class Predictor(eqx.Module):
         def one(drive, dt, level):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
             line = Timeline(dt, drive.shape[0], True)
-            return march_chain(shifted, line, driven_current(actuator, drive, line), self.periods, self.corners)[:3]
+            return march_chain(shifted, line, driven_current(actuator, drive, line), self.periods, self.corners, until=self.until)[:3]
 
         order = np.asarray(self.index)
         levels = jnp.zeros(len(order)) if levels is None else levels
