@@ -1,8 +1,8 @@
 """How many periods a fit simulates until what it reads is settled.
 
 Behind eddy currents H follows the current with a lag of mu_0 c0 N_m A_m chi / R_eddy, chi the slope of the loop; what the start leaves falls
-by exp(-period / lag) with every period. At the 100 ohm of a T&B rod and 200 Hz that is gone after two; at 40 ohm and 700 Hz a fifth is
-left of it by each, and a model that is read after three has a loop of its own that no constants mend.
+by exp(-period / lag) with every period. At 70 ohm and 200 Hz that is gone after two. Of a rod of 40 ohm half is left of it by each at
+450 Hz, and a model that is read after three has a loop of its own that no constants mend.
 """
 
 import numpy as np
