@@ -125,9 +125,10 @@ def test_the_fit_finds_a_demagnetized_start():
     assert wrong.chi2_per_sample > 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("stated", "rest", "found", "told"), [
-    pytest.param("demagnetized", 0.0, "virgin", False, marks=pytest.mark.long), ("demagnetized", 1.23e4, "demagnetized", False),
-    pytest.param("positive_saturation", 1.23e4, "demagnetized", True, marks=pytest.mark.long),
+    ("demagnetized", 0.0, "virgin", False), ("demagnetized", 1.23e4, "demagnetized", False),
+    ("positive_saturation", 1.23e4, "demagnetized", True),
 ])  # fmt: skip
 def test_a_start_that_the_bench_states(stated, rest, found, told):
     """A rod is demagnetized with its bias on or before; a start that the recordings contradict is told, and what they say is taken."""
