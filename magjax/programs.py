@@ -84,11 +84,11 @@ def compiler_options(hasty: bool = False) -> dict:
     return known
 
 
-def forget(kept=lambda kinds: False) -> None:
-    """Drop programs from memory, but those for whose classes of modules `kept` speaks; they are read again where they are asked for."""
+def forget(wanted=lambda kinds: False) -> None:
+    """Drop programs from memory, but those that are `wanted`, by the classes of their modules; they are read again where they are asked for."""
     for known in IN_MEMORY:
         for key, program in tuple(known.items()):
-            if not (program and kept(program.kinds)):
+            if not (program and wanted(program.kinds)):
                 known.pop(key, None)
 
 

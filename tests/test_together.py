@@ -8,7 +8,9 @@ import time
 
 import pytest
 
-from fitting.together import together
+from fitting.together import let_go, together
+from magjax.bench import load_bench
+from magjax.effects import CLASSES
 
 
 def test_results_stand_in_the_order_of_the_calls():
@@ -89,13 +91,28 @@ def test_what_another_makes_needless_is_ended_and_given_up():
     assert quick == [None, "serves", None]  # whether it was done before or not: the clock decides nothing
 
 
+def test_what_an_actuator_needs_stays_in_memory(monkeypatch):
+    """Its own programs, and those of the plain chain; nothing where none is named."""
+    wanted = []
+    monkeypatch.setattr("fitting.together.forget", wanted.append)
+    monkeypatch.setattr("jax.clear_caches", lambda: None)
+    lag, creep = CLASSES["sensor_lag"], CLASSES["creep"]
+    base = load_bench("aa-050h").actuator()
+    for actuators in ((), (base,), (base.with_effect(lag()), base.with_effect(creep()))):
+        let_go(*actuators)
+    told = [[keep({type(base), *kinds}) for kinds in ((), (lag,), (creep,), (lag, creep))] for keep in wanted]
+    assert told == [[False] * 4, [True, False, False, False], [True, True, True, False]]
+
+
 def test_programs_side_by_side_end():
     """Two at once, each with inverses of a batch: split among the threads that programs run on they would wait forever.
     They end, and give what one alone gives."""
     code = """
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
-from fitting.together import together
+from fitting.together import let_go, together
+from magjax.bench import load_bench
+from magjax.effects import CLASSES
 from magjax.linear import inverse_of
 
 run = jax.jit(lambda A: jax.lax.scan(lambda X, _: (X + 1e-3 * jax.vmap(inverse_of)(X), None), A, length=100)[0])
