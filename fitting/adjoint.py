@@ -60,7 +60,7 @@ def marched_steps(template, names, point, predictor) -> Marched:
 
         parameters = jnp.append(point.parameters, 1.0)
         actuator, (applied, current) = made(parameters), driven(parameters)
-        whole = (jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (applied, current))
+        whole = (jnp.append(jnp.tile(x, *predictor.periods), x[:1]) for x in (applied, current))
         steps = linearized(made, parameters, *whole, dt, predictor.corners, actuator.coil.scheme, count)
         relay = steps.relay_field[-count:].mean(axis=1)
         ends = jnp.max(relay), jnp.min(relay)

@@ -3,6 +3,7 @@ signals behind the march. It depends on none of those that the actuator has; how
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -30,17 +31,17 @@ def trajectory(predictor, actuator):
     """The march of every recording, per grid: (field, magnetization, its spread) of the last period, (recordings, samples), and (relay field,
     magnetization, coil current, step) of all periods, (recordings, time)."""
 
-    def one(drive, dt):
+    def one(periods, drive, dt):
         current = driven_current(actuator, drive, Timeline(dt, drive.shape[0], True))
         memory = actuator.hysteresis.memory(actuator.hysteresis.table(), predictor.corners)
-        whole = [jnp.append(jnp.tile(x, predictor.periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
+        whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
         count = len(current)
         H, M, spread, v, _, _ = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, period=count)
         unreached = actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
         last = slice(-count - 1, -1)
         return (H[last], M[last] + unreached, spread[last]), (v, M, whole[1], dt)
 
-    rows = [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
+    rows = [jax.vmap(functools.partial(one, n))(d, t) for d, t, n in zip(predictor.drives, predictor.steps, predictor.periods, strict=True)]
     return [row[0] for row in rows], [row[1] for row in rows]
 
 
@@ -49,15 +50,15 @@ def in_step_change(effect, predictor, actuator, path, finite: bool):
     """What an effect adds to every step along a `trajectory`, 3 of (recordings, time) per grid: its derivative at null, or, `finite`,
     all of it."""
 
-    def one(v, M, current, dt):
+    def one(periods, v, M, current, dt):
         def of(effect):
-            return disturbance_of(effect, actuator, v, M, current, dt, (len(v) - 1) // predictor.periods)
+            return disturbance_of(effect, actuator, v, M, current, dt, (len(v) - 1) // periods)
 
         if finite:
             return of(effect)
         return jax.jvp(lambda a: of(effect.with_amplitude(a)), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
-    return tuple(jax.vmap(one)(*part) for part in path)
+    return tuple(jax.vmap(functools.partial(one, n))(*part) for part, n in zip(path, predictor.periods, strict=True))
 
 
 @seldom

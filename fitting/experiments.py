@@ -151,7 +151,7 @@ def _predicted(result, drives, spectra):
 def _rows_of(problem, z, spectra, coarse):
     """Of some drives: whitened harmonics, (drives, numbers), and their Jacobian."""
     samples = min(d.shape[1] for d in coarse.drives)
-    predictor = Predictor.build(spectra, samples, coarse.harmonics, coarse.periods, max(coarse.corners, 4))
+    predictor = Predictor.build(spectra, samples, coarse.harmonics, max(coarse.periods), max(coarse.corners, 4))
     deviations = np.stack([line_deviations(s, s.noise)[: coarse.harmonics + 1] for s in spectra])
     deviations[:, 0] = np.where(np.isinf(np.asarray(problem.target.deviations)[0, 0]), np.inf, deviations[:, 0])
     m, count = deviations.shape

@@ -94,15 +94,10 @@ def fit(
     )
     compiled(problem, z)
     warm = time.perf_counter() - begin
-    asked, at = choices, z
-    while True:
-        if start is None:
-            problem, z, asked = _long_enough(problem, z, at, actuator, bench, names, asked, spectra, report)
-        problem, solution, choices = _start_memories(problem, z, actuator, bench, names, asked, spectra, start, report, target)
-        if start is not None or solution.interrupted or periods_asked(problem, solution.z) == asked.periods:
-            break
-        at = solution.z
+    asked = choices
+    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, asked, spectra, start, report, target)
     if start is None and solution.chi2 > ASTRAY * problem.data_count and not solution.interrupted:
+        asked = dataclasses.replace(asked, periods=choices.periods)
         found = _with_turning(z, solution, actuator, bench, names, asked, spectra, report, target)
         problem, solution, choices = found or (problem, solution, choices)
     if refine and choices.knots is not None and not solution.interrupted:
@@ -158,23 +153,11 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
     One that the bench does not state is taken only where it meets the noise and none that it states does.
     """
     rests, others = rests_of(bench, choices)
+    build = functools.partial(build_problem, spectra, actuator, bench, names)
 
     def run(rest, posed=None):
         tried = dataclasses.replace(choices, rest=rest)
-
-        def one(say):
-            known, z = build_problem(spectra, actuator, bench, names, tried, _density(start)) if posed is None else posed
-            found = solve(
-                known,
-                z,
-                _weights(start, known, tried),
-                max_jacobians=choices.max_jacobians,
-                target=target,
-                progress=lambda k, c: say(f"fit from {rest}", k, c),
-            )
-            return known, found, tried
-
-        return one
+        return lambda say: _solved(build, *(posed or build(tried, _density(start))), tried, start, target, say)
 
     ended = [run(rests[0], (problem, z))(report)]
     if not settled(*ended[0][:2]) and not ended[0][1].interrupted:
@@ -186,19 +169,41 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
     return best_memory([row for row in ended if row[2].rest not in others or settled(*row[:2])])
 
 
-def _long_enough(problem, z, at, actuator, bench, names, choices, spectra, report):
-    """The problem, its start and choices with as many periods as it takes until they repeat: at first at z = `at`, then where a few
-    Jacobians from the first start memory lead."""
-    while (periods := periods_asked(problem, at)) != choices.periods:
-        choices = dataclasses.replace(choices, periods=periods)
-        first = dataclasses.replace(choices, rest=rests_of(bench, choices)[0][0])
-        problem, z = build_problem(spectra, actuator, bench, names, first)
-        say = functools.partial(report, f"until {periods} periods repeat")
-        brief = solve(problem, z, _weights(None, problem, first), max_jacobians=BRIEF, progress=say)
-        if brief.interrupted:
-            raise KeyboardInterrupt
-        at = brief.z
-    return problem, z, choices
+def _solved(build, problem, z, choices, start, target, say):
+    """A problem solved from z, with as many periods as it takes until they repeat: (problem, solution, choices).
+
+    Where they do not, it begins anew with more, and a few Jacobians from there tell whether these are enough. A fit that goes on from
+    another, `start`, has its periods, and goes on with more where it is of use."""
+    at = z
+    while True:
+        while start is None and not _repeats(problem, at):
+            choices = dataclasses.replace(choices, periods=periods_asked(problem, at))
+            problem, z = build(choices)
+            brief = solve(
+                problem, z, _weights(None, problem, choices), max_jacobians=BRIEF,
+                progress=functools.partial(say, f"until {max(choices.periods)} periods repeat"),
+            )  # fmt: skip
+            if brief.interrupted:
+                raise KeyboardInterrupt
+            at = brief.z
+        found = solve(
+            problem,
+            z,
+            _weights(start, problem, choices),
+            max_jacobians=choices.max_jacobians,
+            target=target,
+            progress=functools.partial(say, f"fit from {choices.rest}"),
+        )
+        if found.interrupted or (start is not None and found.chi2 > target) or _repeats(problem, found.z):
+            return problem, found, choices
+        at = found.z
+        if start is not None:
+            choices, z = dataclasses.replace(choices, periods=periods_asked(problem, at)), at
+            problem, _ = build(choices, _density(start))
+
+
+def _repeats(problem, z) -> bool:
+    return periods_asked(problem, z) == problem.predictors[0].periods_of_each
 
 
 def _with_turning(z, solution, actuator, bench, names, choices, spectra, report, target):

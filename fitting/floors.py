@@ -22,7 +22,7 @@ def solver_floor(problem, solution) -> float:
     """Rms change of the reading when the step is halved, unit of the reading."""
     fine = problem.predictors[1]
     grids = [d.shape[1] for d in fine.drives]
-    twice = Predictor.build(problem.spectra, 2 * min(grids), fine.harmonics, fine.periods, fine.corners)
+    twice = Predictor.build(problem.spectra, 2 * min(grids), fine.harmonics, fine.periods_of_each, fine.corners)
     change = (problem.passes.lines(solution.z, twice) - problem.passes.lines(solution.z, fine))[:, 1:]
     return float(np.sqrt(np.mean(2 * np.sum(np.abs(change) ** 2, axis=1))))
 

@@ -148,7 +148,7 @@ def _whitened(result, spectra):
     problem, predictor = result.problem, result.problem.predictors[0]
     corners = max(predictor.corners, 4 * int(np.ceil(max(nesting(np.tile(s.drive_at(PHASES), 2)) for s in spectra) / 4)))
     grids = tuple(
-        Predictor.build(spectra, samples, predictor.harmonics, predictor.periods, corners, apart=False)
+        Predictor.build(spectra, samples, predictor.harmonics, max(predictor.periods), corners, apart=False)
         for samples in period_samples(result.choices, result.bench)
     )
     width = predictor.harmonics + 1

@@ -6,6 +6,7 @@ recording on a period grid and returns the whitened misfit of the reading's harm
 """
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -137,52 +138,59 @@ class Layout(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The recordings that share a period grid: drive samples (recordings, grid), steps (s), place among all."""
+    """The recordings that share a period grid: drive samples (recordings, grid), steps (s), periods simulated, place among all."""
 
     drive: np.ndarray
     dt: np.ndarray
+    periods: int
     index: np.ndarray
 
 
-def period_grids(spectra, samples: int, apart: bool = True) -> tuple[Grid, ...]:
-    """Recordings grouped by how fine a grid their drive needs, or on that of the finest where not `apart`; `samples` points a period
-    of the highest strong line."""
-    groups: dict[int, list[int]] = {}
+def period_grids(spectra, samples: int, periods, apart: bool = True) -> tuple[Grid, ...]:
+    """Recordings grouped by how fine a grid their drive needs, or on that of the finest where not `apart`, and by their `periods`,
+    (recordings,); `samples` points a period of the highest strong line."""
+    groups: dict[tuple[int, int], list[int]] = {}
     for k, s in enumerate(spectra):
         power = np.abs(s.drive[1:]) ** 2
         strong = np.flatnonzero(power > 1e-3 * power.max())
         factor = int(2 ** np.ceil(np.log2(max(1, strong.max() + 1) / 1.5))) if strong.max() else 1
-        groups.setdefault(samples * min(factor, 8), []).append(k)
-    groups = groups if apart else {max(groups): list(range(len(spectra)))}
+        groups.setdefault((samples * min(factor, 8), int(periods[k])), []).append(k)
+    groups = groups if apart else {tuple(max(x) for x in zip(*groups, strict=True)): list(range(len(spectra)))}
     grids = []
-    for n, members in groups.items():
+    for (n, number), members in groups.items():
         drive = np.stack([spectra[k].drive_at(np.arange(n) / n) for k in members])
         dt = np.asarray([1 / (spectra[k].frequency * n) for k in members])
-        grids.append(Grid(drive, dt, np.asarray(members)))
+        grids.append(Grid(drive, dt, number, np.asarray(members)))
     return tuple(grids)
 
 
 class Predictor(eqx.Module):
-    """Predicted reading harmonics of all recordings for an actuator."""
+    """Predicted reading harmonics of all recordings for an actuator: of the last of the `periods` simulated on each grid."""
 
     drives: tuple[jax.Array, ...]
     steps: tuple[jax.Array, ...]
     index: tuple[int, ...] = eqx.field(static=True)
     harmonics: int = eqx.field(static=True)
-    periods: int = eqx.field(static=True)
+    periods: tuple[int, ...] = eqx.field(static=True)
     corners: int = eqx.field(static=True)
     until: tuple[float, int] | None = eqx.field(static=True, default=None)
 
     @staticmethod
-    def build(spectra, samples: int, harmonics: int, periods: int, corners: int, apart: bool = True, until=None) -> "Predictor":
+    def build(spectra, samples: int, harmonics: int, periods, corners: int, apart: bool = True, until=None) -> "Predictor":
         """For spectra on grids of `samples` points a period of the fastest strong line; not `apart`: one program for all of them.
-        `until`: (tolerance, most) instead of `periods`, see `run_chain`."""
-        grids = period_grids(spectra, samples, apart)
+        `periods`: of all, or of each; `until`: (tolerance, most) instead, see `run_chain`."""
+        grids = period_grids(spectra, samples, np.broadcast_to(periods, len(spectra)), apart)
         order = np.argsort(np.concatenate([g.index for g in grids]))
         return Predictor(
             tuple(on_device(g.drive) for g in grids), tuple(on_device(g.dt) for g in grids),
-            tuple(int(k) for k in order), harmonics, periods, corners, until,
+            tuple(int(k) for k in order), harmonics, tuple(g.periods for g in grids), corners, until,
         )  # fmt: skip
+
+    @property
+    def periods_of_each(self) -> tuple[int, ...]:
+        """Periods simulated of every recording."""
+        found = np.repeat(self.periods, [len(d) for d in self.drives])[np.asarray(self.index)]
+        return tuple(int(n) for n in found)
 
     def __call__(self, actuator, levels=None):
         """Complex Fourier coefficients 0..harmonics of the reading, (recordings, harmonics + 1).
@@ -194,30 +202,30 @@ class Predictor(eqx.Module):
     def march(self, actuator, levels=None):
         """Field, magnetization and its spread of every recording: per grid three of (recordings, samples)."""
 
-        def one(drive, dt, level):
+        def one(periods, drive, dt, level):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
             line = Timeline(dt, drive.shape[0], True)
-            return march_chain(shifted, line, driven_current(actuator, drive, line), self.periods, self.corners, until=self.until)[:3]
+            return march_chain(shifted, line, driven_current(actuator, drive, line), periods, self.corners, until=self.until)[:3]
 
         order = np.asarray(self.index)
         levels = jnp.zeros(len(order)) if levels is None else levels
         levels = levels[np.argsort(order)]  # as the grids hold the recordings
         parts, at = [], 0
-        for drive, dt in zip(self.drives, self.steps, strict=True):
-            parts.append(jax.vmap(one)(drive, dt, levels[at : at + drive.shape[0]]))
+        for drive, dt, periods in zip(self.drives, self.steps, self.periods, strict=True):
+            parts.append(jax.vmap(functools.partial(one, periods))(drive, dt, levels[at : at + drive.shape[0]]))
             at += drive.shape[0]
         return tuple(parts)
 
     def batches(self):
         """The same in parts of whole `ROWS` recordings on one grid, the last repeated: yields (predictor, places of its recordings)."""
         members, at = np.argsort(np.asarray(self.index)), 0
-        for drives, steps in zip(self.drives, self.steps, strict=True):
+        for drives, steps, periods in zip(self.drives, self.steps, self.periods, strict=True):
             drives, steps = np.asarray(drives), np.asarray(steps)
             rows = -(-len(drives) // ROWS) * ROWS
             rows = rows if rows <= MOST_ROWS else 2 * ROWS
             for first in range(0, len(drives), rows):
                 some = np.minimum(np.arange(first, first + rows), len(drives) - 1)
-                part = dataclasses.replace(self, drives=(drives[some],), steps=(steps[some],), index=tuple(range(rows)))
+                part = dataclasses.replace(self, drives=(drives[some],), steps=(steps[some],), periods=(periods,), index=tuple(range(rows)))
                 yield part, members[at + first : at + min(first + rows, len(drives))]
             at += len(drives)
 
@@ -227,11 +235,11 @@ class Predictor(eqx.Module):
         Actuators and recordings are one axis: nested ones are no quicker than one actuator after the other.
         """
 
-        def one(actuator, drive, dt, level):
+        def one(periods, actuator, drive, dt, level):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
             line = Timeline(dt, drive.shape[0], True)
             current = driven_current(actuator, drive, line)
-            fields = march_chain(shifted, line, current, self.periods, self.corners)[:3]
+            fields = march_chain(shifted, line, current, periods, self.corners)[:3]
             zero = jnp.zeros(())
             reading = finish_chain(actuator, line, drive, current, *fields, fields[0], zero, zero).reading
             return jnp.fft.rfft(reading)[: self.harmonics + 1] / drive.shape[0]
@@ -239,11 +247,11 @@ class Predictor(eqx.Module):
         number, order = jax.tree.leaves(actuators)[0].shape[0], np.asarray(self.index)
         levels = (jnp.zeros((number, len(order))) if levels is None else levels)[:, np.argsort(order)]
         parts, at = [], 0
-        for drive, dt in zip(self.drives, self.steps, strict=True):
+        for drive, dt, periods in zip(self.drives, self.steps, self.periods, strict=True):
             count = drive.shape[0]
             rows = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), actuators)
             own = levels[:, at : at + count].ravel()
-            found = jax.vmap(one)(rows, jnp.tile(drive, (number, 1)), jnp.tile(dt, number), own)
+            found = jax.vmap(functools.partial(one, periods))(rows, jnp.tile(drive, (number, 1)), jnp.tile(dt, number), own)
             parts.append(found.reshape(number, count, -1))
             at += count
         return jnp.concatenate(parts, axis=1)[:, order]

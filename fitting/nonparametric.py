@@ -7,6 +7,7 @@ jointly with everything else, and the term is kept only where recordings left ou
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -80,10 +81,10 @@ class Place:
 def _signals(predictor, actuator):
     """Every signal of the last period of every recording with its rates, grid by grid."""
 
-    def one(drive, dt):
+    def one(periods, drive, dt):
         line = Timeline(dt, drive.shape[0], True)
         current = driven_current(actuator, drive, line)
-        marched = march_chain(actuator, line, current, predictor.periods, predictor.corners)
+        marched = march_chain(actuator, line, current, periods, predictor.corners)
         s = finish_chain(actuator, line, drive, current, *marched)
         found = {
             "current": s.current,
@@ -102,7 +103,7 @@ def _signals(predictor, actuator):
         }
         return {**found, **rates, "flux_rate": line.derivative(s.flux_density)}
 
-    return [jax.vmap(one)(d, t) for d, t in zip(predictor.drives, predictor.steps, strict=True)]
+    return [jax.vmap(functools.partial(one, n))(d, t) for d, t, n in zip(predictor.drives, predictor.steps, predictor.periods, strict=True)]
 
 
 def _step_signals(scheme, field, magnetization, current, dt):

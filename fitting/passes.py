@@ -88,12 +88,13 @@ class Passes:
         return [rows[k] for k in self.order]
 
     def magnetizations(self, z):
-        """Magnetization of every recording over all periods of the coarse grid, A/m: yields (periods, samples)."""
-        z, predictor = np.asarray(z, float), self.problem.predictors[0]
+        """Magnetization of every recording over all periods of the coarse grid, A/m: [(periods, samples)]."""
+        z, predictor, found = np.asarray(z, float), self.problem.predictors[0], []
         point = self._point(z)
         for part, places in predictor.batches():
             steps = marched_steps(self.march.actuator, self.march.names, self._of(point, z, part, places), part).steps
-            yield from np.asarray(steps.magnetization)[: len(places), 1:].reshape(len(places), predictor.periods, -1)
+            found += list(np.asarray(steps.magnetization)[: len(places), 1:].reshape(len(places), *part.periods, -1))
+        return [found[k] for k in self.order]
 
     def jacobian(self, z) -> np.ndarray:
         """The derivative of the whitened misfit, on the coarse grid."""

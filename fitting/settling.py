@@ -7,18 +7,31 @@ by exp(-period / lag) with every period. At 70 ohm and 200 Hz that is gone after
 
 import numpy as np
 
-REPEATS = 3e-4  # of the magnetization's peak to peak, by which the last two periods may differ
-LADDER = (3, 6, 12, 24)  # periods simulated; few numbers, for each has programs of its own
+REPEATS = 3e-4  # of the magnetization's peak to peak, that the last period may still be off
+LADDER = (3, 8, 14, 24)  # periods simulated; few numbers, for each has programs of its own
+FALLS = 0.1, 0.95  # what is left falls to at least and at most so much of itself by a period: of three alone one knows it poorly
 
 
-def periods_asked(problem, z) -> int:
-    """Periods to simulate: the next of the LADDER where the magnetization of a recording does not repeat itself at z. A fit to what
-    had not settled has bent to it, and tells no more than that it takes longer."""
-    periods = problem.predictors[0].periods
-    settled = all(_change(M) <= REPEATS for M in problem.passes.magnetizations(z))
-    return periods if settled else next((n for n in LADDER if n > periods), periods)
+def periods_asked(problem, z) -> tuple[int, ...]:
+    """Periods to simulate of each recording: of the LADDER what the magnetization of one takes to settle at z, and all that take
+    more than its first take those of the slowest. A fit to what had not settled has bent to it, and tells no more than that it
+    takes longer."""
+    periods = problem.predictors[0].periods_of_each
+    asked = [_asked(n, *left(M)) for n, M in zip(periods, problem.passes.magnetizations(z), strict=True)]
+    return tuple(n if n <= LADDER[0] else max(asked) for n in asked)
 
 
-def _change(magnetization) -> float:
-    """Between the last two periods of (periods, samples), over the peak to peak."""
-    return float(np.abs(magnetization[-1] - magnetization[-2]).max() / max(np.ptp(magnetization[-1]), 1e-300))
+def _asked(periods, off, falls) -> int:
+    if off <= REPEATS:
+        return periods
+    more = [n for n in LADDER if n > periods] or [periods]
+    return next((n for n in more if off * falls ** (n - periods) <= REPEATS), more[-1])
+
+
+def left(magnetization) -> tuple[float, float]:
+    """How far the last of (periods, samples) is from where they lead to, over the peak to peak, and how much of that a period leaves: two
+    changes tell."""
+    *before, last = np.abs(np.diff(magnetization, axis=0)).max(axis=1)
+    lowest, highest = FALLS
+    falls = min(max(last / before[-1], lowest), highest) if before and before[-1] > 0 else lowest if before else 0.5
+    return float(last * falls / (1 - falls) / max(np.ptp(magnetization[-1]), 1e-300)), float(falls)

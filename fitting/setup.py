@@ -30,14 +30,15 @@ REACH = 30.0  # times the bench's value, or that part of it: as far as a positiv
 class Choices:
     """How a fit is set up. `level`: cells along the plane, the same for all densities, so that these share programs; `knots`:
     hats in s and r, None for one unknown a cell, of `cells` along the plane (a divisor of the level; None: all of them);
-    `coarse`, `fine`: samples a period for the Jacobian and for the residual; `periods`: simulated, the last used."""
+    `coarse`, `fine`: samples a period for the Jacobian and for the residual; `periods`: simulated, the last used, of all
+    recordings or of each."""
 
     level: int = 120
     knots: tuple[int, int] | None = (18, 13)
     cells: int | None = None
     coarse: int = 125
     fine: int = 500
-    periods: int = 3
+    periods: int | tuple[int, ...] = 3
     harmonics: int = HARMONICS
     max_jacobians: int = 30
     without: tuple[str, ...] = ()  # effects that a diagnosis does not ask for: their instrument was measured
@@ -120,7 +121,7 @@ def with_held_masses(choices: Choices, bench, actuator) -> Choices:
 def build_problem(spectra, actuator, bench, names, choices: Choices, start=None) -> tuple[Problem, np.ndarray]:
     """The problem and its starting vector. `start`: a basis, and the density unknowns on it and bottom to go on from, left aside
     where they are of another plane; else equation error."""
-    if choices.periods < 2:
+    if np.min(choices.periods) < 2:
         raise ConfigurationError(f"periods = {choices.periods}: a steady state takes two at least, of which the last is read")
     low, high = applied_range(spectra, actuator)
     margin = PLANE_MARGIN * (high - low)
@@ -171,7 +172,8 @@ def build_problem(spectra, actuator, bench, names, choices: Choices, start=None)
     corners = max(4, max(nesting(np.tile(s.drive_at(np.arange(400) / 400), 2)) for s in spectra))
     corners += len(bench.start) // 2 + 1 if isinstance(bench.start, tuple) else 0
     corners = int(4 * np.ceil(corners / 4))
-    predictors = tuple(Predictor.build(spectra, n, harmonics, choices.periods, corners) for n in period_samples(choices, bench))
+    periods = choices.periods if np.size(choices.periods) in (1, len(spectra)) else max(choices.periods)  # of some of the recordings
+    predictors = tuple(Predictor.build(spectra, n, harmonics, periods, corners) for n in period_samples(choices, bench))
     lines = np.stack([_padded(s.reading, harmonics, 0.0) for s in spectra])
     deviations = np.stack(deviations)
     if actuator.output == "flux_density":  # an integrated emf has no mean

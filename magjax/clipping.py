@@ -19,11 +19,13 @@ FEWEST = 5  # samples that rest: an honest crest leaves two equal ones on its to
 MOST_JUDGED = 16  # crests, evenly over the record
 ARCH = 4.0  # hidden height in tolerances; one where the crest is a parabola, two for t^4
 LARGEST = 0.021  # tolerance in spans: above it noise hides what a crest is like
+FLAT_TOO = 3.0  # the same of a crest that is taken for as flat as another
 CORNER = 0.5  # slope beside the plateau over that farther off; 0.75 where a sine is cut, 0.4 for t^4, less where it saturates
 SEEN = 1e-4  # of the span: less noise hides no crest
 NOISY = 1.5  # counts of noise, rms: from here on values seldom come back
 TIED, TIED_MORE = 8, 4.0  # samples that equal the extreme, and how many times as often as a level near it
 STUCK = 10  # equal samples in a row
+APART = 4.0  # standard deviations of a plateau's level that two of one limit may differ by, beside half a deviation of the noise
 WAVY = 8.0  # deviations of chi2 from what noise leaves of a flat plateau in means of eight samples
 CORNER_IN_NOISE = 0.65  # a plateau of many tolerances' depth has lost the slow part of a round approach
 
@@ -128,8 +130,14 @@ def clipped_crest(x: np.ndarray, drive: np.ndarray | None = None) -> tuple[int, 
         cut = [run for run in runs if _is_cut(x, *run, max(tolerance, step, 3 * noise), max(0.5 * step, noise), corner)]
         if 2 * len(cut) >= len(runs) and cut:
             best = max(cut, key=lambda run: run[1])
-            wavy = _is_wavy(x, cut, max(0.5 * step, noise))
-            if not wavy and not _holds_elsewhere(x, best[1], tolerance, span) and not _rests(drive, *best):
+            scatter = max(0.5 * step, noise)
+            honest = (
+                _is_wavy(x, cut, scatter)
+                or _holds_elsewhere(x, best[1], tolerance, span)
+                or _rests(drive, *best)
+                or _cut_elsewhere(x, best, tolerance, step, noise)
+            )
+            if not honest:
                 return best
     return None
 
@@ -163,12 +171,14 @@ def _runs(where) -> list[tuple[int, int]]:
     return [(int(a), int(b - a)) for a, b in zip(starts, ends, strict=True)]
 
 
-def _is_cut(x, first, length, tolerance, scatter, corner) -> bool:
-    """Whether both flanks meet the plateau at a corner, are not straight, and hide an arch of many tolerances."""
+def _is_cut(x, first, length, tolerance, scatter, corner, arch=ARCH, leaning: bool = False) -> bool:
+    """Whether both flanks meet the plateau at a corner, are not straight, and hide an `arch` of so many tolerances; `leaning`: a plateau
+    that drifts serves."""
     rest = x[first + 1 : first + length - 1]
     level = float(np.median(rest))
     thirds = [part.mean() for part in np.array_split(rest, 3)]
-    if np.ptp(thirds) > 4 * scatter / np.sqrt(len(rest) / 3) + 0.02 * tolerance:
+    round_by = abs(thirds[1] - 0.5 * (thirds[0] + thirds[2])) if leaning else np.ptp(thirds)
+    if round_by > 4 * scatter / np.sqrt(len(rest) / 3) + 0.02 * tolerance:
         return False  # rounded
     slopes = []
     for depth in _flanks(level - x, first, length):
@@ -181,7 +191,7 @@ def _is_cut(x, first, length, tolerance, scatter, corner) -> bool:
         if not slope > max(corner * beyond, 0.0) or _straight(depth[1:reach], scatter):
             return False
         slopes.append(slope)
-    return length * slopes[0] * slopes[1] / (2 * sum(slopes)) > ARCH * tolerance
+    return length * slopes[0] * slopes[1] / (2 * sum(slopes)) > arch * tolerance
 
 
 def _is_wavy(x, runs, scatter) -> bool:
@@ -200,6 +210,27 @@ def _is_wavy(x, runs, scatter) -> bool:
     level = np.average(means, weights=counts)
     misfit = float(np.sum(counts * (means - level) ** 2)) * len(runs) / scatter**2
     return misfit > len(blocks) + WAVY * np.sqrt(2 * len(blocks))
+
+
+def _cut_elsewhere(x, best, tolerance, step, noise) -> bool:
+    """Whether another crest is as flat at a level of its own: a limit is the same each time, where a strain turns at zero it drifts along."""
+    scatter = max(0.5 * step, noise)
+
+    def level(first, length):
+        middle = x[first + length // 4 : first + length - length // 4]
+        return float(np.mean(middle)), 0.5 * scatter + APART * scatter / np.sqrt(len(middle))
+
+    top, unsure = level(*best)
+    crests = _runs(x > 0.5 * (x.max() + x.min()))
+    for first, length in crests[:: len(crests) // MOST_JUDGED + 1]:
+        own = x[first : first + length]
+        start, count = max(_runs(own > own.max() - tolerance), key=lambda run: run[1])
+        if count < max(FEWEST, best[1] // 2) or not _is_cut(x, first + start, count, max(tolerance, step, 3 * noise), scatter, CORNER, FLAT_TOO, True):
+            continue
+        found, error = level(first + start, count)
+        if top - found > np.hypot(unsure, error):
+            return True
+    return False
 
 
 def _flanks(depth, first, length):

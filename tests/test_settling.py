@@ -10,23 +10,69 @@ import pytest
 from fitting.check import check_errors
 from fitting.demo import record
 from fitting.fit import fit
-from fitting.settling import LADDER, periods_asked
-from fitting.setup import Choices
+from fitting.model import predicted_lines
+from fitting.settling import LADDER, left, periods_asked
+from fitting.setup import Choices, build_problem, spectra_of
 from magjax.bench import load_bench
 
 
-def problem(magnetizations, periods):
-    return SimpleNamespace(predictors=[SimpleNamespace(periods=periods)], passes=SimpleNamespace(magnetizations=lambda z: magnetizations))
+def problem(magnetizations, *periods):
+    one = SimpleNamespace(periods_of_each=periods)
+    return SimpleNamespace(predictors=[one], passes=SimpleNamespace(magnetizations=lambda z: magnetizations))
 
 
-@pytest.mark.parametrize(("periods", "left", "asked"), [
-    (3, 1e-4, 3), (3, 1e-3, 6), (5, 1e-3, 6), (6, 1e-3, 12), (12, 1e-3, 24), (24, 1e-3, 24), (40, 1e-3, 40), (2, 1e-4, 2),
+def settling(periods, first, falls):
+    """A loop of height 1 that is off by `first` in its first period, and by `falls` times as much in each one after."""
+    loop = 0.5 * np.sin(2 * np.pi * (np.arange(50) + 0.5) / 50)
+    return loop + first * falls ** np.arange(periods)[:, None]
+
+
+@pytest.mark.parametrize(("periods", "first", "falls", "asked"), [
+    (3, 0.01, 0.1, 3), (3, 0.01, 0.5, 8), (5, 0.01, 0.6, 8), (8, 0.01, 0.5, 8), (3, 1.0, 0.5, 14), (8, 0.1, 0.6, 14), (8, 0.01, 0.9, 24), (24, 1.0, 0.9, 24), (40, 1.0, 0.9, 40),
+    (2, 1e-4, 0.1, 2), (2, 1e-3, 0.1, 8),
 ])  # fmt: skip
-def test_the_next_number_of_periods_where_one_recording_does_not_repeat(periods, left, asked):
-    loop = np.sin(2 * np.pi * np.arange(50) / 50)
-    still = np.tile(loop, (periods, 1))
-    moving = still + 2 * left * (periods - 1 - np.arange(periods))[:, None]
-    assert periods_asked(problem([still, moving], periods), None) == asked
+def test_as_many_periods_as_it_takes_until_a_recording_is_settled(periods, first, falls, asked):
+    """After 3, 1e-2 times 0.5^2 is left, after 8 1e-2 times 0.5^7, which is less than 3e-4."""
+    assert periods_asked(problem([settling(periods, first, falls)], periods), None) == (asked,)
+
+
+def test_what_is_left_is_more_than_the_last_change_where_it_falls_slowly():
+    """0.9 of it by a period: nine times the last change, not a little more than it."""
+    off, falls = left(settling(12, 0.01, 0.9))
+    assert off == pytest.approx(0.01 * 0.9**11, rel=1e-6) and falls == pytest.approx(0.9)
+    assert off > 8 * 0.01 * (0.9**10 - 0.9**11)
+
+
+def test_the_fast_ones_keep_the_least_and_the_slow_ones_share_the_most():
+    """As many programs as there are numbers of periods: two."""
+    rows = [settling(3, 1e-9, 0.1), settling(8, 1e-9, 0.1), settling(8, 0.1, 0.9), settling(3, 0.1, 0.5)]
+    assert periods_asked(problem(rows, 3, 8, 8, 3), None) == (3, 24, 24, 24)
+
+
+def test_recordings_of_different_periods_in_one_fit():
+    """Each is predicted and differentiated as by itself, in the order that they came in."""
+    bench, rng = load_bench("aa-050h"), np.random.default_rng(3)
+    truth = bench.actuator().replace({"coil.R_eddy": 20.0})
+    recordings = [record(truth, f, 0.6, 0.1, rng, f"{f:g} Hz") for f in (200.0, 20.0, 120.0)]
+    each = (4, 2, 4)
+    posed = [
+        build_problem(spectra_of(recordings, bench), truth, bench, ("coil.R_eddy", "mechanics.f0"), Choices(periods=n, rest="negative"))
+        for n in (each, 2, 4)
+    ]
+    mixed, two, four = (p.passes for p, _ in posed)
+    z = posed[0][1]
+    assert mixed.problem.predictors[0].periods_of_each == each
+    assert [len(m) for m in mixed.magnetizations(z)] == list(each)
+    lines, fewer, more = (p.lines(z, p.problem.predictors[1]) for p in (mixed, two, four))
+    assert np.allclose(lines[[0, 2]], more[[0, 2]], rtol=1e-12, atol=0) and np.allclose(lines[1], fewer[1], rtol=1e-12, atol=0)
+    assert not np.allclose(fewer[0], more[0], rtol=1e-6, atol=0)
+    whole = predicted_lines(mixed.problem.predictors[0], mixed.problem.layout.actuator(mixed.problem.template, z))
+    assert np.allclose(mixed.lines(z, mixed.problem.predictors[0]), whole, rtol=1e-9, atol=1e-12 * np.abs(whole).max())
+    width = mixed.problem.target.lines.shape[1]
+    J, slow = mixed.jacobian(z), four.jacobian(z)
+    for k, of in ((0, slow), (1, two.jacobian(z)), (2, slow)):
+        rows = np.concatenate([k * width + np.arange(width), 3 * width + k * (width - 1) + np.arange(width - 1)])
+        assert np.allclose(J[rows], of[rows], rtol=1e-9, atol=1e-9 * np.abs(J).max())
 
 
 def test_a_rod_that_lags_by_more_than_a_period(monkeypatch):
@@ -37,10 +83,16 @@ def test_a_rod_that_lags_by_more_than_a_period(monkeypatch):
     recordings = [record(truth, *drive, rng, f"{drive[0]:g} Hz") for drive in drives]
     near = dataclasses.replace(bench, constants={**bench.constants, "coil.R_eddy": 5.0})
     found = fit(recordings, near, choices=Choices(fine=250), refine=False)
-    assert found.choices.periods in LADDER[1:] and found.chi2_per_sample < 1.2
+    assert max(found.choices.periods) in LADDER[1:] and found.chi2_per_sample < 1.2
     resistance = found.estimate("coil.R_eddy")
     assert abs(resistance.value - 4.0) < 3 * resistance.stderr + 0.02
     row = check_errors(found.actuator, found.actuator, [record(truth, *drives[2], rng, "check")], bench)[0]
     assert row["rms_after"] < 2.5 * row["noise_rms"]
-    monkeypatch.setattr(importlib.import_module("fitting.fit"), "periods_asked", lambda problem, z: problem.predictors[0].periods)
-    assert fit(recordings, near, choices=Choices(fine=250), refine=False).chi2_per_sample > 1.5 * found.chi2_per_sample
+    with monkeypatch.context() as patched:
+        patched.setattr(importlib.import_module("fitting.fit"), "periods_asked", lambda problem, z: problem.predictors[0].periods_of_each)
+        short = fit(recordings, near, choices=Choices(fine=250), refine=False)
+    assert short.chi2_per_sample > 1.5 * found.chi2_per_sample
+    for target, longer in ((np.inf, True), (1.0, False)):  # a fit that goes on from it, and one that is of no use
+        again = fit(recordings, near, actuator=short.actuator, choices=short.choices, start=short, refine=False, target=target)
+        assert (np.max(again.choices.periods) > 3) == longer
+        assert (again.chi2_per_sample < 0.7 * short.chi2_per_sample) == longer

@@ -99,6 +99,29 @@ def test_a_reading_that_rests_with_its_drive_is_not_clipped():
         Recording(t, {"current": np.sin(2 * np.pi * t), "displacement": reading})
 
 
+def bottoms(drift, limit=-np.inf, seed=0):
+    """Bottoms as flat as that of a strain whose M stays near zero for a third of the period, on a zero that drifts by so much in five
+    periods; a converter ends at the limit."""
+    t = phases(100, 5)
+    x = np.maximum(np.sin(2 * np.pi * t), -0.6) + drift * t / t[-1] + 2e-3 * np.random.default_rng(seed).standard_normal(len(t))
+    return np.maximum(x, limit)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bottoms_as_flat_at_levels_of_their_own_are_no_limit(seed):
+    """A strain turns at zero magnetization, and its zero drifts; a limit stays where it is."""
+    assert clipped_crest(-bottoms(0.02, seed=seed)) is None
+    assert clipped_crest(-bottoms(0.0, seed=seed)) is not None
+    assert is_clipped(bottoms(0.02, limit=-0.585, seed=seed))
+
+
+def test_a_lower_crest_that_is_cut_less_leaves_the_limit_a_limit():
+    """Of two tones, the lower crests are round: they are no plateaus of their own."""
+    t = phases(200, 10)
+    two = (1 + 0.3 * np.sin(2 * np.pi * t / 5)) * np.sin(2 * np.pi * t)
+    assert is_clipped(np.minimum(two, 0.95) + 2e-3 * np.random.default_rng(0).standard_normal(len(t)))
+
+
 def test_noise_after_the_cut_does_not_hide_it():
     t = phases(400, 4)
     y = np.minimum(1e-5 * np.sin(2 * np.pi * t), 8e-6) + 1e-9 * np.random.default_rng(0).standard_normal(len(t))
