@@ -174,18 +174,18 @@ def _solved(build, problem, z, choices, start, target, say):
 
     Where they do not, it begins anew with more, and a few Jacobians from there tell whether these are enough. A fit that goes on from
     another, `start`, has its periods, and goes on with more where it is of use."""
-    at = z
+    at, chi2 = z, None
     while True:
-        while start is None and not _repeats(problem, at):
-            choices = dataclasses.replace(choices, periods=periods_asked(problem, at))
+        while start is None and (periods := periods_asked(problem, at, chi2)) != problem.predictors[0].periods_of_each:
+            choices = dataclasses.replace(choices, periods=periods)
             problem, z = build(choices)
             brief = solve(
                 problem, z, _weights(None, problem, choices), max_jacobians=BRIEF,
-                progress=functools.partial(say, f"until {max(choices.periods)} periods repeat"),
+                progress=functools.partial(say, f"until {max(periods)} periods repeat"),
             )  # fmt: skip
             if brief.interrupted:
                 raise KeyboardInterrupt
-            at = brief.z
+            at, chi2 = brief.z, brief.chi2
         found = solve(
             problem,
             z,
@@ -194,16 +194,15 @@ def _solved(build, problem, z, choices, start, target, say):
             target=target,
             progress=functools.partial(say, f"fit from {choices.rest}"),
         )
-        if found.interrupted or (start is not None and found.chi2 > target) or _repeats(problem, found.z):
+        if found.interrupted or (start is not None and found.chi2 > target):
             return problem, found, choices
-        at = found.z
+        at, chi2 = found.z, found.chi2
+        periods = periods_asked(problem, at, chi2)
+        if periods == problem.predictors[0].periods_of_each:
+            return problem, found, choices
         if start is not None:
-            choices, z = dataclasses.replace(choices, periods=periods_asked(problem, at)), at
+            choices, z = dataclasses.replace(choices, periods=periods), at
             problem, _ = build(choices, _density(start))
-
-
-def _repeats(problem, z) -> bool:
-    return periods_asked(problem, z) == problem.predictors[0].periods_of_each
 
 
 def _with_turning(z, solution, actuator, bench, names, choices, spectra, report, target):

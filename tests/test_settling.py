@@ -16,9 +16,13 @@ from fitting.setup import Choices, build_problem, spectra_of
 from magjax.bench import load_bench
 
 
-def problem(magnetizations, *periods):
-    one = SimpleNamespace(periods_of_each=periods)
-    return SimpleNamespace(predictors=[one], passes=SimpleNamespace(magnetizations=lambda z: magnetizations))
+def problem(magnetizations, *periods, misfit=0.0):
+    """Of 1000 numbers, read with a fundamental of 1e4 deviations, so that 3e-4 of it is 3 of these."""
+    lines = np.full((len(periods), 2), 1e4 + 0j)
+    return SimpleNamespace(
+        predictors=[SimpleNamespace(periods_of_each=periods)], data_count=1000, target=SimpleNamespace(lines=lines, deviations=np.ones(lines.shape)),
+        passes=SimpleNamespace(magnetizations=lambda z: magnetizations, residual=lambda z: np.array([misfit])),
+    )  # fmt: skip
 
 
 def settling(periods, first, falls):
@@ -47,6 +51,16 @@ def test_the_fast_ones_keep_the_least_and_the_slow_ones_share_the_most():
     """As many programs as there are numbers of periods: two."""
     rows = [settling(3, 1e-9, 0.1), settling(8, 1e-9, 0.1), settling(8, 0.1, 0.9), settling(3, 0.1, 0.5)]
     assert periods_asked(problem(rows, 3, 8, 8, 3), None) == (3, 24, 24, 24)
+
+
+@pytest.mark.parametrize(("chi2", "asked"), [(1e3, 8), (7.9e3, 8), (8.1e3, 3), (1e9, 3)])
+def test_what_is_left_must_count_beside_the_misfit(chi2, asked):
+    """7 in ten thousand of 1e4 deviations, twice for the square law: 200 of chi2. Near enough to the noise, it is that which counts."""
+    off = 1e-3 * np.sqrt(0.5)
+    row = settling(3, 4 * off, 0.5)
+    assert left(row)[0] == pytest.approx(off)
+    assert periods_asked(problem([row], 3, misfit=np.sqrt(chi2)), None) == (asked,)
+    assert periods_asked(problem([row], 3), None, chi2) == (asked,)
 
 
 def test_recordings_of_different_periods_in_one_fit():
@@ -89,7 +103,7 @@ def test_a_rod_that_lags_by_more_than_a_period(monkeypatch):
     row = check_errors(found.actuator, found.actuator, [record(truth, *drives[2], rng, "check")], bench)[0]
     assert row["rms_after"] < 2.5 * row["noise_rms"]
     with monkeypatch.context() as patched:
-        patched.setattr(importlib.import_module("fitting.fit"), "periods_asked", lambda problem, z: problem.predictors[0].periods_of_each)
+        patched.setattr(importlib.import_module("fitting.fit"), "periods_asked", lambda problem, *_: problem.predictors[0].periods_of_each)
         short = fit(recordings, near, choices=Choices(fine=250), refine=False)
     assert short.chi2_per_sample > 1.5 * found.chi2_per_sample
     for target, longer in ((np.inf, True), (1.0, False)):  # a fit that goes on from it, and one that is of no use
