@@ -184,7 +184,7 @@ def _solved(build, problem, z, choices, start, target, say):
                 progress=functools.partial(say, f"until {max(periods)} periods repeat"),
             )  # fmt: skip
             if brief.interrupted:
-                raise KeyboardInterrupt
+                return problem, brief, choices
             at, chi2 = brief.z, brief.chi2
         found = solve(
             problem,

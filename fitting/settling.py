@@ -11,6 +11,7 @@ from .finer import REFINE_BELOW
 
 REPEATS = 3e-4  # of the magnetization's peak to peak, that the last period may still be off
 LADDER = (3, 8, 14, 24)  # periods simulated; few numbers, for each has programs of its own
+ROUNDED = 1e-9  # of M: a loop that is no higher has none
 MATTERS = 0.03  # of the misfit, that what has not settled may make up: physics that is left out may leave hundreds of times the noise
 FALLS = 0.1, 0.95  # what is left falls to at least and at most so much of itself by a period: of three alone one knows it poorly
 
@@ -48,4 +49,5 @@ def left(magnetization) -> tuple[float, float]:
     *before, last = np.abs(np.diff(magnetization, axis=0)).max(axis=1)
     lowest, highest = FALLS
     falls = min(max(last / before[-1], lowest), highest) if before and before[-1] > 0 else lowest if before else 0.5
-    return float(last * falls / (1 - falls) / max(np.ptp(magnetization[-1]), 1e-300)), float(falls)
+    height = max(np.ptp(magnetization[-1]), ROUNDED * np.abs(magnetization).max(), 1e-300)
+    return float(min(last * falls / (1 - falls) / height, 1.0)), float(falls)

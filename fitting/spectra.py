@@ -67,11 +67,11 @@ def reading_range(spectra) -> tuple[float, float]:
 
 def evaluate_lines(lines: np.ndarray, phases: np.ndarray) -> np.ndarray:
     """The real signal with Fourier coefficients `lines` (0..) at phases in cycles."""
-    used = np.flatnonzero(np.abs(lines) > 0)
-    value = np.zeros(len(phases))
-    for h in used:
-        value += (1.0 if h == 0 else 2.0) * (lines[h] * np.exp(2j * np.pi * h * phases)).real
-    return value
+    turn, value = np.exp(2j * np.pi * phases), np.zeros(len(phases), complex)
+    for line in np.trim_zeros(lines[1:], "b")[::-1]:  # a polynomial in the turn: one exponential for all
+        value += line
+        value *= turn
+    return lines[0].real + 2 * value.real
 
 
 def fit_lines(signal: np.ndarray, phases: np.ndarray, count: int):

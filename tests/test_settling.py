@@ -47,6 +47,12 @@ def test_what_is_left_is_more_than_the_last_change_where_it_falls_slowly():
     assert off > 8 * 0.01 * (0.9**10 - 0.9**11)
 
 
+def test_a_loop_without_height_is_settled():
+    """What is left of rounding is no loop that moves; and no loop is farther off than its height."""
+    assert left(5e5 + 1e-10 * np.random.default_rng(0).standard_normal((3, 50)))[0] < 1e-5
+    assert left(np.array([[0.0, 1.0], [9.0, 9.1], [5e2, 5e2 + 0.1]]))[0] == 1.0
+
+
 def test_the_fast_ones_keep_the_least_and_the_slow_ones_share_the_most():
     """As many programs as there are numbers of periods: two."""
     rows = [settling(3, 1e-9, 0.1), settling(8, 1e-9, 0.1), settling(8, 0.1, 0.9), settling(3, 0.1, 0.5)]
@@ -87,6 +93,17 @@ def test_recordings_of_different_periods_in_one_fit():
     for k, of in ((0, slow), (1, two.jacobian(z)), (2, slow)):
         rows = np.concatenate([k * width + np.arange(width), 3 * width + k * (width - 1) + np.arange(width - 1)])
         assert np.allclose(J[rows], of[rows], rtol=1e-9, atol=1e-9 * np.abs(J).max())
+
+
+def test_an_interrupt_while_periods_are_told_keeps_what_was_reached(monkeypatch):
+    module = importlib.import_module("fitting.fit")
+    stopped = SimpleNamespace(interrupted=True, z=np.ones(3), chi2=5.0)
+    monkeypatch.setattr(module, "periods_asked", lambda *_: (8,))
+    monkeypatch.setattr(module, "_weights", lambda *_: None)
+    monkeypatch.setattr(module, "solve", lambda problem, z, weights, **more: stopped)
+    longer = problem([], 8)
+    ended = module._solved(lambda choices: (longer, np.zeros(3)), problem([], 3), np.zeros(3), Choices(), None, np.inf, lambda *_: None)
+    assert ended[0] is longer and ended[1] is stopped and ended[2].periods == (8,)
 
 
 def test_a_rod_that_lags_by_more_than_a_period(monkeypatch):
