@@ -39,11 +39,11 @@ def loops(evidence, output: str, drive: str, after=None, added: str = "", stem: 
     for k in evidence["chosen"]:
         loop = dict(evidence["loops"][str(k)])
         title = f"{names[k]}\n{plain(frequency[k])} Hz, χ²/N {plain(evidence['chi2'][k])}"
-        strips = [("model", "fitted", loop["model"] - loop["measured"])]
+        strips = [("model", loop["model"] - loop["measured"])]
         if after is not None and str(k) in after["loops"]:
             second = after["loops"][str(k)]
             loop["after"] = second["model"] + loop["measured"] - second["measured"]
-            strips = [("model", "before", strips[0][2]), ("after", "after", second["model"] - second["measured"])]
+            strips.append(("after", second["model"] - second["measured"]))
             title = f"{names[k]}\n{plain(frequency[k])} Hz, χ²/N {plain(evidence['chi2'][k])} → {plain(after['chi2'][k])}"
         panels.append((title, loop, strips))
     what = "fitted" if after is None else "simulated before and after the repair"
@@ -69,11 +69,12 @@ def checks(entries, output: str, drive: str, rows, repaired: bool = True, added:
     for key, entry in list(entries.items())[:SHOWN]:
         row = rows[int(key)]
         loop = {**entry, "model": entry["before"]}
-        strips = [("model", "before", entry["before"] - entry.get("recorded", entry["measured"]))]
+        strips = [("model", entry["before"] - entry.get("recorded", entry["measured"]))]
         if repaired:
-            strips.append(("after", "after", entry["after"] - entry["measured"]))
+            strips.append(("after", entry["after"] - entry["measured"]))
         else:
             loop.pop("after")
+            loop["called"] = "predicted"
         factor, unit = scale_of(output)[2:]
         size = " → ".join(plain(factor * row[k]) for k in (("rms_before", "rms_after") if repaired else ("rms_after",)))
         panels.append((f"{entry['name']}\nrms {size} {unit}, noise {plain(factor * row['noise_rms'])}", loop, strips))
@@ -142,7 +143,7 @@ def _loop(axes, loop, drive_factor, factor, heading):
         color=MODEL,
         lw=1.0,
         ls=(0, (4, 1.6)),
-        label="before" if "after" in loop else "fitted",
+        label="before" if "after" in loop else loop.get("called", "fitted"),
     )
     if "after" in loop:
         axes.plot(close(drive), factor * close(loop["after"]), color=INK, lw=0.8, label="after")
@@ -159,9 +160,9 @@ def _strip(axes, loop, strips, fine):
     axes.axhline(0, color=MUTED, lw=0.5)
     below = {"lw": 2.6, "alpha": 0.45} if len(strips) > 1 else {"lw": 0.9}  # seen under the other
     styles = {"model": {"color": MODEL, **below}, "after": {"color": INK, "lw": 0.8}}
-    for key, _, values in strips:
+    for key, values in strips:
         axes.plot(phase, fine * values, **styles[key])
-    reach = max(np.max(np.abs(fine * values)) for _, _, values in strips)
+    reach = max(np.max(np.abs(fine * values)) for _, values in strips)
     reach = max(1.1 * reach, 1.6 * band)
     axes.set(xlim=(0, 1), ylim=(-reach, reach))
     axes.locator_params(axis="y", nbins=3)

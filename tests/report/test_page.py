@@ -469,7 +469,7 @@ def test_check_recordings_of_a_fit_are_drawn(folders):
     page = (folders["fit"] / "report.html").read_text(encoding="utf-8")
     assert page.count("check_150Hz.csv") >= 2 and 'aria-label="Check recordings"' in page
     drawn = page.split('aria-label="Check recordings"')[1].split("</svg>")[0]
-    assert ">fitted</text>" in drawn and ">before</text>" not in drawn and "before and after" not in page
+    assert ">predicted</text>" in drawn and ">before</text>" not in drawn and "before and after" not in page
 
 
 def test_a_learned_function_has_a_panel_for_each_value_of_its_second_variable():

@@ -55,6 +55,15 @@ def test_a_legend_of_long_names_stays_in_its_figure_and_off_the_headings(monkeyp
     assert legend.x1 <= figure.bbox.x1 and heading < legend.y0
 
 
+@pytest.mark.parametrize(("repaired", "names"), [(False, ["measured", "predicted"]), (True, ["measured", "before", "after"])])
+def test_a_check_recording_is_predicted_not_fitted(monkeypatch, repaired, names):
+    phase, drawn = np.arange(8) / 8, []
+    row = {"name": "check.csv", "drive": np.sin(phase), "phase": phase, "noise": np.ones(8), **{k: phase for k in ("measured", "before", "after")}}
+    monkeypatch.setattr(loops, "picture", lambda figure, *words: drawn.append(figure))
+    loops.checks({"0": row}, "displacement", "current", [{"rms_before": 2e-7, "rms_after": 1e-7, "noise_rms": 4e-8}], repaired)
+    assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == [*names, "twice the noise of the mean"]
+
+
 def test_text_stands_out_from_its_ground():
     """WCAG: 4.5 for text, 3 for lines that carry meaning."""
 
