@@ -9,11 +9,12 @@ import numpy as np
 
 from magjax.plausibility import si_unit
 
-from .spectra import evaluate_lines, fit_lines, reduce_recording, with_noise
+from .spectra import ON_LINE, evaluate_lines, fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
 HUM_TONES = 3
 CLEAR, LEAST_SHOWN = 25.0, 0.1  # chi2 that a signal of a size would take between the harmonics, and the share that must show
+STANDS_OUT = 2.5  # times the largest of the six harmonics beside it, that a hum on a harmonic of the drive is
 MOST_SHOW = 0.5  # of the recordings where a signal would be clear, more of which must show it, or deny it
 LONE_GAIN = 60.0  # fall of chi2 from which a drift of one record may be its alone
 SETTLING = (0.04, 0.15)  # of the record's length: times with which such a record may settle
@@ -260,10 +261,23 @@ def _tones(s, frequencies):
         pair = [np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]
         reduced = [_between(s, p) for p in pair]
         seen = sum(np.sum(np.abs(c) ** 2) for _, _, c in reduced) / sum(np.sum(np.abs(np.fft.rfft(p)) ** 2) for p in pair)
-        if f < 0.45 / s.dt and seen > 0.05:
+        if f < 0.45 / s.dt and seen > 0.05 and not _is_own(s, f):
             parts += list(zip(pair, reduced, strict=True))
             kinds += [k, k]
     return parts, kinds
+
+
+def _is_own(s, f) -> bool:
+    """Whether a tone falls on a harmonic of the drive beyond those that the reading is told by, and stands out from the next ones no
+    more than they do."""
+    order = int(round(f / s.frequency))
+    if order < len(s.reading) or abs(f - order * s.frequency) * s.samples * s.dt > ON_LINE:
+        return False
+    beside = np.array([k for k in range(order - 3, order + 4) if k >= len(s.reading) and k != order])
+    orders = np.append(beside, order)
+    waves = np.exp(-2j * np.pi * np.outer(orders, np.arange(s.samples) * s.dt * s.frequency))
+    *others, own = np.abs(waves @ s.residue)
+    return own < STANDS_OUT * max(others)
 
 
 def _between(s, column):
