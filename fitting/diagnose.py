@@ -62,7 +62,10 @@ EXPECTED = 1.5  # beyond so many times what it expects for cells that no recordi
 UNSEEN_TEXT = "Check recordings are missed, times their noise: {}; about as the fit expects, for they switch cells that no recording did."
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
-LATE_TEXT = "The limit of {:g} min (--minutes of magjax diagnose) left out what was still to be tried; with more time it may find more, or rivals to what it names."
+LATE_TEXT = (
+    "The limit of {:g} min (--minutes of magjax diagnose; in its last two fifths nothing is begun anew) left out what was still to be tried; "
+    "with more time it may find more, or rivals to what it names."
+)
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 

@@ -81,9 +81,10 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
     the best that was fitted in a round under way, where the round would not have refused it."""
     state = Reached(base, [], {}, foretell=Foreteller(check, base))
     scored = {c.name: c for c in candidates}
+    any_rest = task.choices.rest == "auto"  # that of the base was chosen under its misfit
     task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
     try:
-        task, made_up, needless = _forward(task, base, state, candidates, check, ends, free_means)
+        task, made_up, needless = _forward(task, base, state, candidates, any_rest, check, ends, free_means)
         state.under_way = {}
         if not needless:
             _once_more(task, state, made_up, scored, check, ends)
@@ -105,10 +106,10 @@ def _once_more(task, state, made_up, scored, check, ends):
         ends(state.current)
 
 
-def _forward(task, base, state, candidates, check, ends, free_means):
-    """The rounds, into the `state`. Returns the task on the density that was chosen beside the effects, the candidate of
-    `state.form`, and whether the rest of the search is needless."""
-    any_rest, made_up = task.choices.rest == "auto", None
+def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
+    """The rounds, into the `state`; `any_rest`: whether start memories beside the base's may be tried. Returns the task on the density
+    that was chosen beside the effects, the candidate of `state.form`, and whether the rest of the search is needless."""
+    made_up = None
     for _round in range(MAX_EFFECTS):
         top = leaders(candidates)
         hidden = not top or abs(top[0].z) < Z_THRESHOLD

@@ -206,6 +206,27 @@ def test_the_search_leaves_out_rivals_that_it_has_found(monkeypatch):
     assert [names(rivals) for _, rivals, *_ in found.steps] == [["amplifier_clipping"], ["coulomb_friction"]]
 
 
+@pytest.mark.parametrize(("asked", "free"), [("auto", True), ("demagnetized", False)], ids=["the fit's choice", "as told"])
+def test_the_start_memory_of_the_plain_fit_is_chosen_anew_beside_an_effect(monkeypatch, asked, free):
+    """A plain fit at 32 of the noise that took the wrong memory by 10 %: check recordings were missed by 16 of their noise, for 3."""
+    base, given = trial("none", 30.0).result, []
+    base.choices, base.actuator = Choices(rest="demagnetized"), SimpleNamespace(effects=())
+
+    def settled(task, now, best, good, excess, any_rest, any_density):
+        given.append(any_rest)
+        return best, good, task
+
+    monkeypatch.setattr(fitting.search, "try_all", lambda *a: [trial("sensor_lag", 1.0, base=30.0)])
+    monkeypatch.setattr(fitting.search, "screened", lambda result, choices: [])
+    monkeypatch.setattr(fitting.search, "refitted", settled)
+    monkeypatch.setattr(fitting.search, "promises", lambda *a: True)
+    monkeypatch.setattr(fitting.search, "_once_more", lambda *a: None)
+    monkeypatch.setattr(fitting.search, "let_go", lambda *a: None)
+    task = Task((), load_bench("aa-050h"), Choices(rest=asked))
+    fitting.search.search(task, base, [candidate("sensor_lag", 150.0)])
+    assert given == [free]
+
+
 HIDDEN = [candidate("stress_feedback", 4.3), candidate("creep", 3.2, (0, 1, 0)), candidate("mean_field", -2.0, (0, 0, 1))]
 
 

@@ -7,7 +7,7 @@ import re
 from . import found as pictures
 from . import learned, loops, misfit, plane, tables
 from .banner import headline, spoken, tone
-from .fit_page import DEFINED, bounds_of, convergence_part, headed, residual_section, sentence, validity
+from .fit_page import AT_NOISE, DEFINED, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
 from .residuals import repeating
 from .style import percent, plain, scale_of, terms_in, unit_text, words
@@ -125,7 +125,9 @@ def _groups(found, facts):
             why = tie["why"] or ("the best" if name in ties else "")
             row += [plain(tie["chi2_per_sample"]), said_of(why)] if ties else []
             rows.append([*row, about.get("signature", "")])
-    text = "Each of these repairs the model, and to name one from these recordings would be a guess."
+    whole = found["verdict"] != "unknown_at"  # else something is left that none of them explains
+    does = "Each of these repairs the model" if whole else "Each of these takes the same part of the misfit"
+    text = f"{does}, and to name one from these recordings would be a guess."
     text += " Why each is not told from the best stands beside it; χ²/N is that of a fit with it." if ties else ""
     head = [
         "rival",
@@ -214,10 +216,11 @@ def _where(found, facts, base, repaired, sketch, output, drive):
     marks = {facts[n]["block"]: "a rival acts here" for g in found["groups"] for n in g if n in facts}
     marks |= {e["block"]: "effect named here" for e in found["effects"]}
     marks |= {found["unknown"]["block"]: "acts most like this"} if found["unknown"] else {}
+    met = not marks and found["base"]["chi2_per_sample"] < AT_NOISE
     return section(
         "Where simulation and recordings differ",
         part(text=FRAMED if "function" in (found["unknown"] or {}) else ""),
-        sketch(where.get("by_block"), pictures.block_map, where, marks, drive),
+        sketch(where.get("by_block"), pictures.block_map, where, marks, drive, met),
         *headed(
             "Misfit against the noise floor, by frequency and harmonic", sketch(base, misfit.misfit_map, base, beside=repaired)
         ),

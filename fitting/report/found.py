@@ -10,11 +10,12 @@ BLOCKS = ("source", "coil", "hysteresis", "magnetostriction", "mechanics", "sens
 THRESHOLD = 5.5  # of |z|, as the search uses it
 
 
-def block_map(where, marks, drive: str, stem: str = "blocks"):
+def block_map(where, marks, drive: str, met: bool = False, stem: str = "blocks"):
     """The chain of blocks, each shaded by the share of what is above the noise that its best effect could explain; `marks`:
-    block -> what the verdict says of it."""
+    block -> what the verdict says of it; `met`: nothing is above the noise, and there are no shares of it."""
     shares = where["by_block"]
     shown = [b for b in BLOCKS if b in shares or b in marks]
+    told = {b: "–" if met else percent(shares.get(b, 0.0)) for b in shown}
     wide = 1.0 / max(len(shown), 1)
     with styled():
         figure = canvas(WIDTH, 1.45)
@@ -22,13 +23,13 @@ def block_map(where, marks, drive: str, stem: str = "blocks"):
         axes.set(xlim=(0, 1), ylim=(0, 1))
         axes.axis("off")
         for k, block in enumerate(shown):
-            share = float(shares.get(block, 0.0))
+            share = 0.0 if met else float(shares.get(block, 0.0))
             left = k * wide + 0.012
             tint = np.array([1.0, 1.0, 1.0]) * (1 - share) + np.array([0.90, 0.62, 0.0]) * share
             named = block in marks
             axes.add_patch(_box(left, wide - 0.03, tint, 2.4 if named else 0.8))
             axes.text(left + 0.5 * (wide - 0.03), 0.70, block, ha="center", va="center", fontweight="bold" if named else "normal")
-            axes.text(left + 0.5 * (wide - 0.03), 0.47, percent(share), ha="center", va="center", fontsize=11)
+            axes.text(left + 0.5 * (wide - 0.03), 0.47, told[block], ha="center", va="center", fontsize=11)
             axes.text(left + 0.5 * (wide - 0.03), 0.25, marks.get(block, ""), ha="center", va="center", fontsize=7.5)
             if k + 1 < len(shown):
                 axes.annotate(
@@ -40,8 +41,10 @@ def block_map(where, marks, drive: str, stem: str = "blocks"):
         caption = (
             f"The chain from {drive} to reading. The percentage is the share of what is above the noise that the best single effect of the block could "
             "take, to first order; blocks overlap, so shares do not add up. A thick frame marks the blocks of which the verdict speaks."
+            if not met
+            else f"The chain from {drive} to reading. The model meets the noise: nothing is above it that a block could have a share of."
         )
-        words = ", ".join(f"{b} {percent(shares.get(b, 0.0))}" + (f" ({marks[b]})" if b in marks else "") for b in shown)
+        words = ", ".join(f"{b} {told[b]}" + (f" ({marks[b]})" if b in marks else "") for b in shown)
         return picture(figure, stem, "Block map: what each block could explain", caption, words)
 
 

@@ -356,6 +356,14 @@ def test_each_rival_says_why_it_is_not_told_from_the_best(folders, tmp_path):
     assert "about as well as the others" not in page
 
 
+def test_a_group_beside_an_unknown_repairs_nothing(folders, tmp_path):
+    found = json.loads((folders["group"] / "diagnosis.json").read_text())
+    for verdict, does in (("group", "repairs the model"), ("unknown_at", "takes the same part of the misfit")):
+        unknown = {"block": "sensor", "region": "", "explained_share": 0.5} if verdict == "unknown_at" else None
+        (tmp_path / "diagnosis.json").write_text(json.dumps({**found, "verdict": verdict, "unknown": unknown}))
+        assert f"Each of these {does}, and to name one" in rebuild(tmp_path).read_text(encoding="utf-8")
+
+
 def test_loops_say_what_was_added_and_what_the_band_is(diagnoses, folders, tmp_path):
     found = json.loads((folders["attributed"] / "diagnosis.json").read_text())
     found["repaired"]["parameters"]["effects.excess_loss.k"] = {**found["repaired"]["parameters"]["mechanics.xi"], "unit": "1"}
@@ -627,6 +635,17 @@ def test_a_block_is_shaded_by_its_share_of_what_is_above_the_noise(poor, fitted,
     assert where(poor, [all_of_it, half], runs[0], "displacement")["by_block"] == pytest.approx({"sensor": 1.0, "coil": 0.5})
     weak = dataclasses.replace(half, predicted_chi2_drop=3.0)  # where only noise is left its own scatter is what it is measured by
     assert where(fitted, [weak], runs[0], "displacement")["by_block"]["coil"] < 0.2
+
+
+def test_where_the_noise_is_met_no_block_has_a_share_of_what_is_above_it(folders, tmp_path):
+    shutil.copy(folders["nothing_missing"] / "report.npz", tmp_path)
+    stored = json.loads((folders["nothing_missing"] / "diagnosis.json").read_text())
+    stored["where"]["by_block"] = {"coil": 0.97}
+    for chi2, shared in ((0.99, False), (1.31, True)):
+        stored["base"]["chi2_per_sample"] = chi2
+        (tmp_path / "diagnosis.json").write_text(json.dumps(stored))
+        page = rebuild(tmp_path).read_text(encoding="utf-8")
+        assert ("coil 97 %" in page) is shared and ("nothing is above it that a block could have a share of" in page) is not shared
 
 
 def test_many_recordings_stay_below_a_megabyte(folders, tmp_path):
