@@ -64,7 +64,7 @@ def spectra_of(recordings, bench, harmonics: int = HARMONICS):
 
     spectra = [reduced(r) for r in recordings]
     if bench.output == "displacement" and "mechanics.f0" in bench.constants:
-        starts = unsettled_starts(spectra, float(bench.constants["mechanics.f0"]), float(bench.constants["mechanics.xi"]))
+        starts = unsettled_starts(spectra, float(bench.constants["mechanics.f0"]))
         for k, start in enumerate(starts):
             if start is not None:
                 spectra[k] = dataclasses.replace(reduced(_less(recordings[k], bench.output, start)), start=start)

@@ -88,8 +88,8 @@ def _later_noise(spectra):
     return estimate_noise(halves) if halves else None
 
 
-def unsettled_starts(spectra, f0: float, xi: float) -> list:
-    """For each spectrum the decaying start over its samples, unit of the reading, or None; `f0`, `xi`: about where."""
+def unsettled_starts(spectra, f0: float) -> list:
+    """For each spectrum the decaying start over its samples, unit of the reading, or None; `f0`: about where, Hz."""
     nothing = [None] * len(spectra)
     usable = [k for k, s in enumerate(spectra) if s.periods >= 2 and len(s.between_f) >= 40]
     gaps = [_Gaps.of(spectra[k], _white(spectra[k])) for k in usable]

@@ -47,13 +47,13 @@ def test_free_motion_solves_the_equation_without_drive(xi):
 
 
 def test_an_unsettled_start_is_found_to_the_noise():
-    for s, start in zip(made := spectra(1e-6), unsettled_starts(made, 392.0, 0.7783), strict=True):
+    for s, start in zip(made := spectra(1e-6), unsettled_starts(made, 392.0), strict=True):
         assert start is not None and np.abs(start - 1e-6 * motion(s.dt, s.samples)).max() < NOISE
 
 
 @pytest.mark.parametrize("other", [{}, {"slow": 1e-6}, {"slow": 1e-5}, {"drift": 1e-6}, {"drift": 1e-5}])
 def test_nothing_is_taken_out_where_nothing_of_the_kind_is(other):
-    assert unsettled_starts(spectra(**other), 392.0, 0.7783) == [None] * 9
+    assert unsettled_starts(spectra(**other), 392.0) == [None] * 9
 
 
 @pytest.mark.long

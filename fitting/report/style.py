@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from magjax.terms import Terms, terms_of
 
 INK, MUTED, PALE = "#1a1a1a", "#555555", "#c8c8c8"
-BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#007F5C", "#E69F00", "#56B4E9", "#A3527F"
-MEASURED, MODEL, AFTER = BLUE, VERMILION, GREEN
+BLUE, VERMILION, GREEN, ORANGE, SKY = "#0072B2", "#D55E00", "#007F5C", "#E69F00", "#56B4E9"
+MEASURED, MODEL = BLUE, VERMILION
 SEQUENTIAL = "cividis"
 FONT = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', Arial, sans-serif"
 RC = {

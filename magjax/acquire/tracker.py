@@ -2,7 +2,6 @@
 
 HALF = 1 << 31
 FULL = 1 << 32
-RECENT = 4096  # frames back that may be a repeat
 
 
 class Tracker:
