@@ -29,6 +29,7 @@ from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
 from .locate import where
+from .memories import STATES
 from .own_signals import (
     drifts_of_one,
     heat_on_harmonics,
@@ -49,6 +50,7 @@ from .search import search
 from .setup import Choices, spectra_of, with_held_masses
 from .spoilt import FAR, mended_by, spoilt
 from .task import Clock, Late, Task
+from .told_memory import told_by_checks
 from .verdict import HALF, WORSE, Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
 
 ABSORBED_VISIBILITY = 0.004
@@ -66,6 +68,7 @@ LATE_TEXT = (
     "The limit of {:g} min (--minutes of magjax diagnose; in its last two fifths nothing is begun anew) left out what was still to be tried; "
     "with more time it may find more, or rivals to what it names."
 )
+MEMORY_TEXT = "The recordings of the fit do not tell their start memory; the check recordings do: {}."
 UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
@@ -276,11 +279,18 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
         needless = before_zeros and needless_zeros(before_zeros[0].sparing, reached)
     if needless:
         return _examined(before_zeros[0], measured, before_zeros[1], check, zeros=False)
+    told = None
+    with contextlib.suppress(Late):
+        told = told_by_checks(task.sparing, reached.current, reached.foretell)
+    if told is not None:
+        plain, raw = (plain, raw) if reached.steps else (told, raw if adopted else told)
+        reached = dataclasses.replace(reached, current=told)
     evidence = Evidence(
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried), task.choices.only,
     )  # fmt: skip
-    return with_zero(_concluded(task, evidence), zero, rival)
+    found = with_zero(_concluded(task, evidence), zero, rival)
+    return found if told is None else found.noted(MEMORY_TEXT.format(STATES[told.choices.rest]))
 
 
 def _concluded(task, evidence) -> Diagnosis:

@@ -7,6 +7,9 @@ from .setup import field_of_rest
 RESTS = {  # a rod is demagnetized with its bias on, or before that was put on
     "negative_saturation": ("negative",), "demagnetized": ("demagnetized", "virgin"), "positive_saturation": ("positive",),
 }  # fmt: skip
+STATES = {  # in words
+    "negative": "negative saturation", "demagnetized": "the demagnetized state", "virgin": "the demagnetized state, without bias", "positive": "positive saturation",
+}  # fmt: skip
 RESTS_IN_ORDER = tuple(found[0] for found in RESTS.values())
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried

@@ -8,7 +8,7 @@ from magjax.plausibility import si_unit
 from magjax.recording import stray_samples
 
 from .floors import swapped
-from .memories import RESTS
+from .memories import RESTS, STATES
 from .result import RecordingFit
 from .spectra import hum_part
 
@@ -36,8 +36,7 @@ def contradicted(bench, choices) -> str:
     """A sentence where the recordings are met from another start than the bench states."""
     if bench.start not in RESTS or choices.rest in (*RESTS[bench.start], "held", "auto"):
         return ""
-    met = "the demagnetized state" if choices.rest == "demagnetized" else f"{choices.rest} saturation"
-    return f"; the recordings are not met from the start that the bench states, {bench.start}, but from {met}"
+    return f"; the recordings are not met from the start that the bench states, {bench.start}, but from {STATES[choices.rest]}"
 
 
 def recording_fits(problem, residual, recordings, bench):

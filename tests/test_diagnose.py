@@ -71,6 +71,18 @@ def test_silent_where_nothing_is_missing(bench):
             "next_experiment", "placebo", "message", "base", "repaired", "ties"} == set(content)  # fmt: skip
 
 
+def test_the_model_offered_begins_where_the_check_recordings_say(bench, monkeypatch):
+    def other(task, current, foretell):
+        assert foretell and task.choices.rest == "auto"
+        return dataclasses.replace(current, choices=dataclasses.replace(current.choices, rest="positive"))
+
+    monkeypatch.setattr(module, "told_by_checks", other)
+    runs, checks = study(bench)
+    found = diagnose(runs[:3], bench, check=checks, choices=Choices(only=("sensor_lag",)))
+    assert found.verdict == "nothing_missing" and found.base.choices.rest == "positive"
+    assert "do not tell their start memory; the check recordings do: positive saturation" in str(found)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("asked", "said"),

@@ -13,6 +13,8 @@ from fitting.memories import best_memory
 from fitting.recipe import lag_recipe
 from fitting.setup import Choices
 from fitting.starts import unreached_row
+from fitting.task import Task
+from fitting.told_memory import told_by_checks
 from magjax.bench import load_bench
 from magjax.errors import ConfigurationError
 from magjax.preisach import Preisach, density_masses
@@ -174,3 +176,44 @@ def test_the_levels_tell_the_start_memory_where_much_is_amiss(ended, best):
         return known, SimpleNamespace(chi2=648 * chi2n, z=z), Choices(rest=name)
 
     assert best_memory([row(name, *found) for name, found in ended.items()])[2].rest == best
+
+
+def of_memory(rest, chi2, strain=0.1):
+    known = SimpleNamespace(data_count=500, layout=SimpleNamespace(memories=4, names=()))
+    solution = SimpleNamespace(chi2=chi2, z=np.full(4, np.sqrt(strain / 4)))
+    return SimpleNamespace(
+        problem=known, solution=solution, chi2_per_sample=chi2 / 500, data_count=500, choices=Choices(rest=rest), actuator=None,
+        bench=load_bench("aa-050h"), spectra=(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("others", "says", "more", "told"),
+    [
+        ({"demagnetized": 500.2, "positive": 506.0}, {"demagnetized": 9.5, "positive": 9.0}, {}, "demagnetized"),
+        ({"demagnetized": 500.2, "positive": 506.0}, {"demagnetized": 5.0, "positive": 5.0}, {}, None),  # no strong evidence
+        ({"demagnetized": 504.0, "positive": 540.0}, {"demagnetized": 9.0, "positive": 90.0}, {}, None),  # not met as well from there
+        ({}, {}, {"missed": False}, None),
+        ({}, {}, {"start": "negative_saturation"}, None),
+        ({}, {}, {"rest": "negative"}, None),
+    ],
+    ids=["told", "hardly", "against the recordings", "not missed", "the bench states it", "as given"],
+)
+def test_check_recordings_tell_a_start_memory_that_those_of_the_fit_do_not(monkeypatch, others, says, more, told):
+    """A fit from the wrong one met its noise as well and missed a larger drive by 68 of it."""
+    asked, current = [], of_memory("negative", 500.0)
+
+    def fit_or_stop(*a, choices, start, **k):
+        asked.append(choices.rest)
+        return of_memory(choices.rest, others[choices.rest])
+
+    def foretell(result):
+        return SimpleNamespace(whitened=2.0)
+
+    foretell.says_for = lambda after, before: says[after.choices.rest]
+    monkeypatch.setattr("fitting.task.fit_or_stop", fit_or_stop)
+    monkeypatch.setattr("fitting.told_memory.apart", lambda rests, problem: list(rests))
+    monkeypatch.setattr("fitting.told_memory._missed", lambda *a: more.get("missed", True))
+    bench = dataclasses.replace(load_bench("aa-050h"), start=more.get("start", "auto"))
+    found = told_by_checks(Task((), bench, Choices(rest=more.get("rest", "auto"))), current, foretell)
+    assert (found and found.choices.rest) == told and sorted(asked) == sorted(others)
