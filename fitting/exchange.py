@@ -131,7 +131,7 @@ def _promised_anew(task, current, rest, known, check) -> list[Trial]:
 
     An effect that imitates two is adopted first, and neither of them need be among its rivals then.
     """
-    if not check or current.chi2_per_sample > MISFIT or not _missed(current, check, task.bench):
+    if not check or current.chi2_per_sample > MISFIT or not missed(current, check, task.bench):
         return []
     task.say("what else goes with the others", current.chi2_per_sample)
     base = task.fit_on(rest, rest.actuator)
@@ -146,7 +146,7 @@ def _promised_anew(task, current, rest, known, check) -> list[Trial]:
     return trials
 
 
-def _missed(result, check, bench) -> bool:
+def missed(result, check, bench) -> bool:
     """Whether check recordings are foretold to worse than 1.4 of their noise, in the mean of the squares."""
     rows = check_errors(result.actuator, result.actuator, check, bench)
     return misfit(rows, "rms_after") > len(rows)

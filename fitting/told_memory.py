@@ -9,8 +9,7 @@ import dataclasses
 import numpy as np
 
 from .attribute import MIN_DROP, chi2_of
-from .check import check_errors
-from .diagnosis import misfit
+from .exchange import missed
 from .memories import against_memory, apart, rests_of
 from .task import freed_beyond
 from .together import together
@@ -26,7 +25,9 @@ def told_by_checks(task, current, foretell):
     the others, which grants each fit what it expects to miss.
     """
     rests = rests_of(task.bench, task.choices)[0]
-    if len(rests) < 2 or not foretell or foretell(current) is None or not _missed(current, foretell):
+    if len(rests) < 2 or not foretell or foretell(current) is None:
+        return None
+    if not missed(current, [foretell.recordings[k] for k in foretell.places], task.bench):
         return None
     rests = [rest for rest in apart(rests, current.problem) if rest != current.choices.rest]
     task.say("another start memory", current.chi2_per_sample)
@@ -43,9 +44,3 @@ def told_by_checks(task, current, foretell):
     said = [(said_for(other), other) for other in together([fitted(rest) for rest in rests], task.progress)]
     most, best = max(said, key=lambda row: row[0], default=(0.0, None))
     return best if most > STRONG else None
-
-
-def _missed(result, foretell) -> bool:
-    recordings = [foretell.recordings[k] for k in foretell.places]
-    rows = check_errors(result.actuator, result.actuator, recordings, result.bench)
-    return misfit(rows, "rms_after") > len(rows)

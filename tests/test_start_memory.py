@@ -210,10 +210,11 @@ def test_check_recordings_tell_a_start_memory_that_those_of_the_fit_do_not(monke
     def foretell(result):
         return SimpleNamespace(whitened=2.0)
 
+    foretell.recordings, foretell.places = ("check",), (0,)
     foretell.says_for = lambda after, before: says[after.choices.rest]
     monkeypatch.setattr("fitting.task.fit_or_stop", fit_or_stop)
     monkeypatch.setattr("fitting.told_memory.apart", lambda rests, problem: list(rests))
-    monkeypatch.setattr("fitting.told_memory._missed", lambda *a: more.get("missed", True))
+    monkeypatch.setattr("fitting.told_memory.missed", lambda *a: more.get("missed", True))
     bench = dataclasses.replace(load_bench("aa-050h"), start=more.get("start", "auto"))
     found = told_by_checks(Task((), bench, Choices(rest=more.get("rest", "auto"))), current, foretell)
     assert (found and found.choices.rest) == told and sorted(asked) == sorted(others)
