@@ -17,9 +17,10 @@ from tests.blind.generator.coil import shell_matrix
 from tests.blind.generator.density import KINDS, SPAN, PlayDensity
 from tests.blind.generator.instruments import record
 from tests.blind.generator.strain import settled_play
+from tests.blind.oracle import FILE as ORACLE
 from tests.blind.oracle import Sight
 from tests.blind.run import diagnose, run_cases
-from tests.blind.score import coverage, judge, kept_line, read, read_all, wilson
+from tests.blind.score import coverage, judge, kept_line, read, read_all, table, wilson
 from tests.blind.strengths import GROUPS, HIDDEN, OUTSIDE, VISIBLE
 
 FOLDER = Path(__file__).parent / "blind"
@@ -152,6 +153,29 @@ def test_scorer():
     assert judge(case, None, 3) == "data_problem" and judge(case, None, 1) == "failed"
     low, high = wilson(40, 40)
     assert 0.91 < low < 0.92 and high > 0.999
+
+
+@pytest.mark.parametrize("suite", ["dev", "val", "test"])
+def test_the_oracle_has_seen_every_effect(suite):
+    seen = json.loads(ORACLE.read_text())
+    cases = [make_case(suite, k) for k in range(size(suite))]
+    assert {c.name: set(c.effects) for c in cases if c.effects} == {n: set(z) for n, z in seen.items() if n.startswith(suite)}
+
+
+def test_the_table_tells_by_what_the_oracle_saw():
+    """What it sees at less than 10 does not count among what it sees at 10 or more; of a pair the lesser one does."""
+    seen = json.loads(ORACLE.read_text())
+    cases = [c for c in (make_case("test", k) for k in range(size("test"))) if c.name in seen and c.kind in ("single", "pair")]
+    found = {"verdict": "attributed", "groups": [], "absorbed": [], "check": [], "unknown": None}
+    rows = [
+        (c, found | {"effects": [{"name": n, "confidence": 0.95} for n, z in seen[c.name].items() if z >= 10]}, {"status": 0, "seconds": 1.0})
+        for c in cases
+    ]
+    text = table("test", rows)
+    for kind in ("single", "pair"):
+        clear = sum(c.kind == kind and min(seen[c.name].values()) >= 10 for c in cases)
+        assert f"at z = 10 or more, {kind}s: right or in a group {clear}/{clear}: " in text
+    assert "| 0 to 5 | 2 | 0 | 0 | 0 | 0 | 2 | 0/2: " in text  # pairs of which one cannot be seen
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,12 @@
 Outcomes. right: exactly what is concealed is named, nothing else (nulls: silence; outside: unknown_at; data: data_problem or a
 refusal). group: the truth stands in a group and nothing foreign is named. kin: another member of the truth's known group is named
 alone. extra: the truth and something foreign. partly: one of two. silent: nothing is claimed. unknown: unknown_at. wrong: the rest.
-Shares carry Wilson intervals of 95 %. Where ORACLE.json holds a single's z (what one who
-knows the law could see), a second table tells by it.
+Shares carry Wilson intervals of 95 %. Where ORACLE.json holds the z of what is concealed (what one who knows the law could see),
+singles and pairs are told by it, too.
 """
 
 import argparse
+import itertools
 import json
 from collections import Counter
 from pathlib import Path
@@ -187,10 +188,8 @@ def table(suite: str, rows) -> str:
     rank = ("null", "decoy", "single", "pair", "outside", "hidden", "data")
     for key in sorted(by, key=lambda k: (rank.index(k[0]), ("weak", "mid", "strong", "").index(k[1]))):
         got = by[key]
-        good = sum(o in ("right", "group") for o in got)
-        low, high = wilson(good, len(got))
         cells = " | ".join(str(got.count(o) or "") for o in used)
-        lines.append(f"| {' '.join(filter(None, key))} | {len(got)} | {cells} | {good}/{len(got)}: {low:.0%} to {high:.0%} |")
+        lines.append(f"| {' '.join(filter(None, key))} | {len(got)} | {cells} | {_share(got)} |")
     lines.append("")
     if closed:
         lines.append(f"Gap of the check error to the noise closed (power, median of {len(closed)}): {np.median(closed):.0%}.")
@@ -243,29 +242,34 @@ def _believed(rows) -> list[str]:
     return lines
 
 
+SEEN = 10.0  # an oracle's z from which the targets of the proof ask for a name
+
+
 def _by_sight(rows):
-    """Singles and pairs by what the oracle could see, and the targets of the proof."""
+    """Singles, and pairs by the lesser of the two, by what the oracle could see, and what the targets of the proof ask for."""
     seen = json.loads(ORACLE.read_text()) if ORACLE.exists() else {}
-    bands = {"below 5": [], "5 to 10": [], "10 to 30": [], "30 to 100": [], "above 100": []}
-    for case, diagnosis, done in rows:
-        if case.kind == "single" and case.name in seen:
-            z = max(seen[case.name].values())
-            key = next(k for k, top in zip(bands, (5, 10, 30, 100, np.inf), strict=True) if z < top)
-            bands[key].append(judge(case, diagnosis, done["status"]))
-    if not any(bands.values()):
-        return []
-    lines = [
-        "",
-        "| single, oracle z | cases | right | group | kin | silent | other | right or group, 95 % |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for key, got in bands.items():
-        if got:
-            n = [sum(o == w for o in got) for w in ("right", "group", "kin", "silent")]
-            low, high = wilson(n[0] + n[1], len(got))
-            cells = " | ".join(map(str, [*n, len(got) - sum(n)]))
-            lines.append(f"| {key} | {len(got)} | {cells} | {n[0] + n[1]}/{len(got)}: {low:.0%} to {high:.0%} |")
+    lines = []
+    for kind, title in (("single", "single, oracle z"), ("pair", "pair, lesser oracle z")):
+        known = [(min(seen[c.name].values()), judge(c, d, done["status"])) for c, d, done in rows if c.kind == kind and c.name in seen]
+        if not known:
+            continue
+        lines += ["", f"| {title} | cases | right | group | kin | silent | other | right or group, 95 % |", "|---|" + "---|" * 7]
+        for low, high in itertools.pairwise((0.0, 5.0, SEEN, 30.0, 100.0, np.inf)):
+            if got := [outcome for z, outcome in known if low <= z < high]:
+                n = [got.count(w) for w in ("right", "group", "kin", "silent")]
+                cells = " | ".join(map(str, [*n, len(got) - sum(n)]))
+                band = f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
+                lines.append(f"| {band} | {len(got)} | {cells} | {_share(got)} |")
+        if got := [outcome for z, outcome in known if z >= SEEN]:
+            lines += ["", f"Seen by the oracle at z = {SEEN:g} or more, {kind}s: right or in a group {_share(got)}."]
     return lines
+
+
+def _share(outcomes) -> str:
+    """How many are right or in a group, with its interval."""
+    good = sum(o in ("right", "group") for o in outcomes)
+    low, high = wilson(good, len(outcomes))
+    return f"{good}/{len(outcomes)}: {low:.0%} to {high:.0%}"
 
 
 def confusion(rows) -> str:
