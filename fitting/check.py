@@ -5,6 +5,7 @@ import numpy as np
 from magjax.extrema import nesting
 from magjax.plausibility import si_unit
 from magjax.simulate import simulate
+from magjax.words import sized
 
 from .model import Predictor, predicted_lines
 from .spectra import evaluate_lines, hum_part, reduce_recording
@@ -95,3 +96,9 @@ def check_errors(before, after, recordings, bench, cleaned=None) -> list[dict]:
              "beyond_plane": beyond_plane(after, recording, bench)}
         )  # fmt: skip
     return rows
+
+
+def foretold_text(rows) -> str:
+    """What a repair does to the errors of check recordings, rows of `check_errors`, a sentence; "" without any."""
+    each = (f"{r['file'].rsplit('/', 1)[-1]}: {sized(r['unit'], r['rms_before'], r['rms_after'])}" for r in rows)
+    return f" On check recordings: {'; '.join(each)}." if rows else ""

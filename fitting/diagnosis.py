@@ -1,12 +1,14 @@
 """A diagnosis, the evidence that its verdict is read from, and the measures of a misfit that both share."""
 
 import dataclasses
+import re
 
 import numpy as np
 
 from .experiments import next_experiment
 from .reach import beyond_text
 
+MOST_NAMED = 3  # files of one error that are told by name
 SILENT_CHI2 = 1.15  # above it something may be missing even where no single name stands out
 
 
@@ -138,11 +140,21 @@ class Evidence:
 
 def unusable(errors, sound=()) -> Diagnosis:
     """The verdict over files that cannot be used, by their errors; `sound`: the recordings that can."""
-    text = " ".join(f"{error}." for error in errors)
+    told = {}  # what is the same of several files but for its numbers is said once
+    for error in map(str, errors):
+        told.setdefault(re.sub(r"\d[\d.e+-]*", "", error.partition(": ")[2]) or error, []).append(error)
+    text = " ".join(f"{first}{_and_so(others)}." for first, *others in told.values())
     if sound:
         others = "The other recording" if len(sound) == 1 else f"The other {len(sound)} recordings"
         text += f" {others} can be read and {'is' if len(sound) == 1 else 'are'} not clipped."
     return Diagnosis("data_problem", text, data_problem=str(errors[0]))
+
+
+def _and_so(others) -> str:
+    """That files with these errors have the same one, in words."""
+    names = [error.partition(": ")[0] for error in others]
+    which = f"{len(names)} other files" if len(names) > MOST_NAMED else " and ".join(names)
+    return f" (the same of {which})" if names else ""
 
 
 def misfit(rows, which: str) -> float:

@@ -7,6 +7,7 @@ data themselves: drift, an unsettled start, periods that do not repeat.
 import numpy as np
 
 from magjax.plausibility import si_unit
+from magjax.words import sized
 
 from .model import Predictor
 from .record_level import drift_of
@@ -53,17 +54,17 @@ def _unsettled(recordings, spectra, output) -> str | None:
             sudden = first > 0.03 * s.peak_to_peak and first > 8 * floor and first > 4 * later
             if sudden and _changes(_by_period(s, y - drift_of(s)[1]))[0] > NO_DRIFT * first:
                 return (
-                    f"{recording.name}: the first period differs from the last by {first:.3g} {unit} rms and later ones do not: an unsettled "
+                    f"{recording.name}: the first period differs from the last by {sized(unit, first)} rms and later ones do not: an unsettled "
                     "transient; cut the first periods or wait before recording"
                 )
             moved = float(np.abs(blocks[-1].mean() - blocks[0].mean()))
             if moved > 0.05 * widest and moved > 8 * floor:
-                return f"{recording.name}: the reading drifts by {moved:.3g} {unit} through the record; let it warm up, or remove the drift first"
+                return f"{recording.name}: the reading drifts by {sized(unit, moved)} through the record; let it warm up, or remove the drift first"
     recording, s = min(zip(recordings, spectra, strict=True), key=lambda pair: pair[1].samples * pair[1].dt)
     y = _reading(recording, s, output) - drift_of(s)[1]
     if s.periods >= 2 and (change := _changes(_by_period(s, y))[0]) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
         return (
-            f"{recording.name}: the periods do not repeat: the last differs from the first by {change:.3g} {unit} rms within "
+            f"{recording.name}: the periods do not repeat: the last differs from the first by {sized(unit, change)} rms within "
             f"{s.samples * s.dt * 1e3:.3g} ms, and no drift explains it; wait until the reading is settled, then record"
         )
     if (share := _restless(recordings, spectra, output)) is not None:

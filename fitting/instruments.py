@@ -15,7 +15,7 @@ from magjax.effects import SensorLag, TransportDelay
 from magjax.errors import RecordingError
 from magjax.instruments import SENSOR_LAWS, fit_laws, judge_laws, judge_source
 
-from .check import check_errors
+from .check import check_errors, foretold_text
 from .fit import fit_or_stop as fit
 from .joint import data_residual
 from .memories import rests_of
@@ -300,11 +300,7 @@ def _joined(known, found, plain, final, check_plain, check, bench, texts):
     text = (
         f"{texts} With {named} in place chi2/N falls from {plain.chi2_per_sample:.3g} to {final.chi2_per_sample:.2f}; {constants}."
     )
-    if checks:
-        better = "; ".join(
-            f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in checks
-        )
-        text += f" On check recordings: {better}."
+    text += foretold_text(checks)
     nothing = found.verdict == "nothing_missing" and found.ended_after is None
     rest = "Beyond that nothing is missing." if nothing else f"Beyond that: {found.message}"
     return dataclasses.replace(

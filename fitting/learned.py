@@ -15,7 +15,7 @@ from magjax.programs import kept
 from magjax.simulate import run_chain
 
 from .attribute import AT_NOISE
-from .check import check_errors
+from .check import check_errors, foretold_text
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .nonparametric import ONE, Place, locate_places
@@ -359,7 +359,6 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None, l
     if learned.rivals:
         rivals = [f"{p.block} ({p.joined(words)})" for p in learned.rivals]
         text += f" Not told from it: {'; '.join(rivals)}."
-    better = "; ".join(f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in rows)
-    text += f" On check recordings: {better}." if better else ""
+    text += foretold_text(rows)
     text += " Beyond the range seen its interval widens."
     return dataclasses.replace(found, message=text, unknown=unknown, check=rows or found.check, repaired=learned.result)

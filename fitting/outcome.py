@@ -6,6 +6,7 @@ import numpy as np
 
 from magjax.plausibility import si_unit
 from magjax.recording import stray_samples
+from magjax.words import sized
 
 from .floors import swapped
 from .memories import RESTS, STATES
@@ -27,7 +28,7 @@ def beyond_the_rod(spectra, actuator, bench) -> str:
     if stroke <= MOST_STROKE * reach:
         return ""
     return (
-        f"; the reading moves by {stroke:.3g} m, and the rod gives {reach:.3g} m at most (lambda_s l_rod): no parameter is physical; "
+        f"; the reading moves by {sized('m', stroke)}, and the rod gives {sized('m', reach)} at most (lambda_s l_rod): no parameter is physical; "
         "set scale or unit in [columns.displacement], or lambda_s and l_rod of the bench"
     )
 
@@ -102,7 +103,7 @@ def unsettled(spectra) -> str:
     starts = [float(np.abs(s.start).max()) for s in spectra if s.start is not None]
     if not starts:
         return ""
-    return f"; {len(starts)} of {len(spectra)} recordings began unsettled: a decaying motion of up to {max(starts):.2g} m was taken out"
+    return f"; {len(starts)} of {len(spectra)} recordings began unsettled: a decaying motion of up to {sized('m', max(starts), digits=2)} was taken out"
 
 
 def outcome(chi2n, rows, solution, parameters, problem, limit=None) -> str:

@@ -8,6 +8,8 @@ import dataclasses
 
 import numpy as np
 
+from magjax.words import sized
+
 from .attribute import BIC_DROP, CLOSE, MIN_DROP, MISFIT, SETTLED_CHI2, TIE, WEAK_TIE, chi2_of, excess_of, settled, try_effect
 from .diagnosis import SILENT_CHI2, Diagnosis, least_excess
 from .finer import FINER_FROM
@@ -235,9 +237,9 @@ def sensor_zero(task, base, candidates):
 def with_zero(found, zero, rival) -> Diagnosis:
     """The diagnosis with a word on the sensor's zero: adopted, or told of beside an effect that does as well."""
     if zero is not None:
-        note = f" The sensor's zero is {zero:.3g} m away from the rod's rest; free sensor.offset in the bench file."
+        note = f" The sensor's zero is {sized('m', zero)} away from the rod's rest; free sensor.offset in the bench file."
     elif rival is not None and (found.effects or found.groups):
-        note = f" A sensor's zero {rival:.3g} m away from the rod's rest would explain as much; if it was not set there, free sensor.offset in the bench file."
+        note = f" A sensor's zero {sized('m', rival)} away from the rod's rest would explain as much; if it was not set there, free sensor.offset in the bench file."
     else:
         return found
     return dataclasses.replace(found, message=found.message + note)

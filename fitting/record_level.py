@@ -8,6 +8,7 @@ import dataclasses
 import numpy as np
 
 from magjax.plausibility import si_unit
+from magjax.words import sized
 
 from .spectra import ON_LINE, evaluate_lines, fit_lines, reduce_recording, with_noise
 
@@ -179,7 +180,7 @@ def without_lone_drifts(recordings, lone, output):
         origin = {**recordings[k].origin, "zero": float(np.ptp(reading))}  # where it settles is not known
         cleaned[k] = dataclasses.replace(recordings[k], channels={**recordings[k].channels, output: _less(reading, fit)}, origin=origin)
         told.append(
-            f"{recordings[k].name} alone drifts, by {np.ptp(fit):.3g} {si_unit(output)}, which was taken out: it was not settled, or its sensor moved."
+            f"{recordings[k].name} alone drifts, by {sized(si_unit(output), np.ptp(fit))}, which was taken out: it was not settled, or its sensor moved."
         )
     return cleaned, told
 

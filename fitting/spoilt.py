@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 
 from magjax.plausibility import si_unit
+from magjax.words import sized
 
 from .attribute import MISFIT
 from .check import beyond_plane, prediction, predictions
@@ -102,7 +103,7 @@ def mended_by(actuator, recording, bench) -> str | None:
         text = "moves against what they make of it: the sign of a channel is swapped" if abs(gain + 1) < SWAPPED else text
         found.append((gain * predicted - measured, f"its reading {text}"))
         level = float(np.mean(measured - predicted))
-        found.append((predicted + level - measured, f"its reading lies {level:.3g} {unit} from where they put it: its zero has moved"))
+        found.append((predicted + level - measured, f"its reading lies {sized(unit, level)} from where they put it: its zero has moved"))
         late, shifted = _delayed(predicted, measured, recording)
         text = f"its reading comes {abs(late) * 1e3:.3g} ms {'later' if late > 0 else 'earlier'} than they make it"
         found.append((shifted - measured, f"{text}: align its columns"))

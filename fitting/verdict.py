@@ -9,8 +9,10 @@ import dataclasses
 
 import numpy as np
 
+from magjax.words import sized
+
 from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, rivals_of
-from .check import check_errors
+from .check import check_errors, foretold_text
 from .diagnosis import Diagnosis, Evidence, least_excess, misfit
 from .experiments import INSTRUMENTS, instrument_request
 from .instruments import exchange
@@ -40,7 +42,7 @@ EXPECTED, AGAINST = 1.5, 0.1  # chi2 per number in these units, up to which a re
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the {} going on."
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
-ZEROS_TEXT = " The reading's level changes from recording to recording by {:.2g} m (rms) more than the model's; the means take no part in the fit."
+ZEROS_TEXT = " The reading's level changes from recording to recording by {} (rms) more than the model's; the means take no part in the fit."
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 PLAIN_TEXT = "The model offered is the plain one, which predicts the check recordings better than any repair."
 HIDDEN_TEXT = (
@@ -116,7 +118,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     for effect, _ in evidence.adopted:
         if effect.shapes.get("zeros"):
             slow = behind(effect, evidence)
-            form += BEHIND_TEXT.format(slow) if slow else ZEROS_TEXT.format(effect.amplitude)
+            form += BEHIND_TEXT.format(slow) if slow else ZEROS_TEXT.format(sized("m", effect.amplitude, digits=2))
         elif (slow := creeps_on(effect, evidence)) and CREEPS_TEXT.format(slow) not in form:
             form += CREEPS_TEXT.format(slow)
     form += led or (DOMINANT_TEXT if alone and evidence.missing and not rough else "")
@@ -259,12 +261,10 @@ def _grouped(evidence, common, effects, groups, rivals, swap, asked) -> Diagnosi
 
 def _attributed(evidence, common, effects, swap, asked) -> Diagnosis:
     named = " and ".join(f"{e['name']} ({e['block']})" for e in effects)
-    better = "; ".join(
-        f"{r['file'].rsplit('/', 1)[-1]}: {r['rms_before']:.3g} -> {r['rms_after']:.3g} {r['unit']}" for r in common["check"]
-    )
+    better = foretold_text(common["check"])
     text = f"{named} {'was' if len(effects) == 1 else 'were'} left out: {_fall(evidence)}."
     text += " Not all rivals were fitted." if evidence.reached.partial else ""
-    text += f" On check recordings: {better}." if better else " Record a check at another frequency to confirm it."
+    text += better or " Record a check at another frequency to confirm it."
     if swap:
         text += f" {swap[0]} To tell: {asked['text']}."
     return Diagnosis("attributed", text, tuple(effects), next_experiment=asked, **common)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .errors import RecordingError
 from .plausibility import UNITS, si_unit
+from .words import sized
 
 RESTING, MOVES = 0.1, 0.3  # of the samples at the highest or lowest value, from which the noise is taken between: so many must be there
 FEWEST = 5  # samples that rest: an honest crest leaves two equal ones on its top, three with some luck
@@ -79,11 +80,10 @@ def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarr
     """Raise `RecordingError` where a channel, (time,), is clipped or stuck; `drive`, (time,): what may hold still meanwhile."""
     values = np.asarray(values, float)
     unit = "V" if "emf" in channel else si_unit(channel) if channel in UNITS else ""
-    per = f" {unit}".rstrip()
     stuck = stuck_stretch(values)
     if stuck is not None:
         raise RecordingError(
-            f"{name}: {channel} stands still at {values[stuck[0]]:.4g}{per} for {stuck[1]} samples from sample {stuck[0]}, in which its "
+            f"{name}: {channel} stands still at {sized(unit, values[stuck[0]], digits=4)} for {stuck[1]} samples from sample {stuck[0]}, in which its "
             "noise is gone: samples were lost or the converter hung; record again or cut there",
             _shown(channel, unit, values, *stuck),
         )
@@ -93,7 +93,7 @@ def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarr
             first, length = found
             level = float(np.median(values[first : first + length]))
             raise RecordingError(
-                f"{name}: {channel} is clipped at its {word} value {level:.4g}{per} for {length} samples from sample {first}; "
+                f"{name}: {channel} is clipped at its {word} value {sized(unit, level, digits=4)} for {length} samples from sample {first}; "
                 "lower the gain or the drive and record again",
                 _shown(channel, unit, values, first, length),
             )

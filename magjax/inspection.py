@@ -6,9 +6,10 @@ import numpy as np
 
 from .clipping import quantum
 from .errors import RecordingError
-from .plausibility import STRONG_FIELD
+from .plausibility import STRONG_FIELD, si_unit
 from .recording import NO_ANSWER, follows_nothing, stray_samples
 from .terms import DRIVE_UNITS
+from .words import sized
 
 LITTLE = 1e-4  # of the relays of the plane: a hundredth of its width
 MOST_FILLED = 0.05  # of the samples: more is no measurement
@@ -67,7 +68,7 @@ def inspect(recording, bench) -> Card:
     facts, problems, warnings = {}, [], []
     facts["samples"] = f"{len(x)} at {recording.dt:.6g} s ({len(x) * recording.dt:.4g} s)"
     facts["drive"] = f"{bench.drive} {x.min():.5g} .. {x.max():.5g}"
-    facts["reading"] = f"{bench.output} {y.min():.5g} .. {y.max():.5g}"
+    facts["reading"] = f"{bench.output} {sized(si_unit(bench.output), y.min(), y.max(), digits=5, joined=' .. ')}"
     for name, v in ((bench.drive, x), (bench.output, y)):
         step = quantum(v)
         if step > 0:
@@ -183,16 +184,16 @@ def _judge_repeats(recording, channel, facts, problems):
     if count < 2:
         facts["noise"] = "one period only: it cannot be told from the repeats"
         return
-    noise = recording.repeat_noise(channel)
+    noise, unit = recording.repeat_noise(channel), si_unit(channel)
     span = float(np.ptp(y))
     if follows_nothing(recording, channel):
         problems.append(NO_ANSWER.format(channel=channel, drive=recording.drive))
-    facts["noise from repeats"] = f"{noise:.3g} rms ({noise / span:.2g} of the range)"
+    facts["noise from repeats"] = f"{sized(unit, noise)} rms ({noise / span:.2g} of the range)"
     drift = float(blocks[-1].mean() - blocks[0].mean())
     settle = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))
     late = float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if count > 2 else settle
-    facts["drift"] = f"{drift:.3g} from first to last period"
+    facts["drift"] = f"{sized(unit, drift)} from first to last period"
     if abs(drift) > 0.02 * span and abs(drift) > 6 * noise / np.sqrt(per):
-        problems.append(f"the reading drifts by {drift:.3g} ({abs(drift) / span:.1%} of the range); warm up or remove the drift")
+        problems.append(f"the reading drifts by {sized(unit, drift)} ({abs(drift) / span:.1%} of the range); warm up or remove the drift")
     if count > 2 and settle > 0.02 * span and settle > 4 * late:
-        problems.append(f"unsettled transient: the first period is {settle:.3g} rms off the last; cut it or wait before recording")
+        problems.append(f"unsettled transient: the first period is {sized(unit, settle)} rms off the last; cut it or wait before recording")

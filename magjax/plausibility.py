@@ -3,6 +3,7 @@
 import numpy as np
 
 from .errors import RecordingError
+from .words import sized
 
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0},
@@ -84,6 +85,6 @@ def check_sizes(name: str, channels: dict, units: dict, bench):
         stroke = float(np.nanmax(channels["displacement"]) - np.nanmin(channels["displacement"]))
         if stroke > 30 * reach or 0 < stroke < 1e-5 * reach:
             raise RecordingError(
-                f"{name}: a stroke of {stroke:.4g} m where the {what} gives {reach:.3g} m at {at}; "
+                f"{name}: a stroke of {sized('m', stroke)} where the {what} gives {sized('m', reach)} at {at}; "
                 f"{mend('displacement', stroke, usual['displacement'])}"
             )

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 FENCE = re.compile(r"<!-- test: (?P<what>[^>]*?) -->\n```(?P<language>\w+)\n(?P<content>.*?)```", re.S)
 TINY = 5e-9  # below it (m, A) a number is noise
+FACTORS = {"um": 1e-6, "nm": 1e-9}  # of the word after a number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,9 +107,9 @@ def differs(expected: str, got: str, block: Block) -> str | None:
         first, second = words_of(a), words_of(b)
         if len(first) != len(second):
             return f"stated: {a}\ncame:   {b}"
-        for x, y in zip(first, second, strict=True):
-            p, q = number(x), number(y)
-            close = p is not None and q is not None and abs(p - q) <= max(block.within * max(abs(p), abs(q)), TINY)
+        for x, y, after in zip(first, second, [*first[1:], ""], strict=True):
+            p, q, tiny = number(x), number(y), TINY / FACTORS.get(after.strip(".,;()"), 1.0)
+            close = p is not None and q is not None and abs(p - q) <= max(block.within * max(abs(p), abs(q)), tiny)
             if x != y and not close:
                 return f'"{x}" was stated, "{y}" came, in\nstated: {a}\ncame:   {b}'
     return None

@@ -101,7 +101,7 @@ def test_a_large_drift_of_every_record_is_named_and_that_of_one_spoils_it(monkey
 
     monkeypatch.setattr(module, "_examined", examined)
     found = module.diagnose(runs, BENCH)
-    assert "the reading drifts by 3e-06 m through" in found.message and "let it warm up" in found.message
+    assert "the reading drifts by 3 um through" in found.message and "let it warm up" in found.message
     assert found.verdict == ("data_problem" if len(drifting) == 1 else "attributed")
     assert found.message.startswith("zero_drift was left out. As recorded") == (len(drifting) == 4)
 

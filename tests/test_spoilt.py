@@ -37,7 +37,7 @@ def changed(row, reading=None, current=None, clock=1.0):
 SPOILT = {
     "gain": ({"reading": lambda y: 1.3 * y}, "its reading is 1.3 times"),
     "sign": ({"reading": lambda y: -y}, "the sign of a channel is swapped"),
-    "zero": ({"reading": lambda y: y + 2e-5}, "its reading lies 2e-05 m from where they put it"),
+    "zero": ({"reading": lambda y: y + 2e-5}, "its reading lies 20 um from where they put it"),
     "delay": ({"reading": lambda y: np.roll(y, 25)}, "later than they make it"),
     "current": ({"current": lambda x: 2 * x}, "its current is 2 times"),
     "time": ({"clock": 3.0}, "its times are 3"),

@@ -12,8 +12,7 @@ DEFINED = (
     "χ²/N: the squared misfit of each harmonic of the reading over the variance of its noise, mean over all N numbers. It is 1 where only noise is "
     "left; its root says how many times its noise the misfit is that repeats every period."
 )
-NANOMETRES = re.compile(r"(\d[\d.]*e-0[6-9])(?: → (\d[\d.]*e-\d\d))? m\b")
-MICROMETRES = re.compile(r"(\d[\d.]*e-0[45]) m\b")
+MICRO = re.compile(r"(?<=\d) u(?=[msAVT]\b)")
 BELOW_NOISE, AT_NOISE, FAR = 0.5, 1.1, 2.0  # chi2/N: noise overstated; the error bars hold; they mean nothing
 WORST_AT_NOISE = 1.6
 FEWEST_STEPS = 3  # that make a picture of how the fit went
@@ -144,21 +143,13 @@ def convergence_part(sketch, fit):
     return sketch(steps if len(steps) >= FEWEST_STEPS else None, misfit.convergence, steps)
 
 
-def _small(lengths) -> str:
-    """One length in metres or two, in micrometres or nanometres."""
-    values = [float(v) for v in lengths.groups() if v]
-    factor, unit = (1e6, "µm") if max(values) >= 1e-6 else (1e9, "nm")
-    return " → ".join(f"{factor * v:.3g}" for v in values) + f" {unit}"
-
-
 def sentence(text: str) -> str:
     """A message with a capital (unless it begins with a name) and a full stop, its signs as people write them."""
     text = re.sub(r"(?<=\d)%", "\u00a0%", text)
     text = text.strip().replace(" -> ", " → ").replace("chi2/N", "χ²/N").replace("= nan", "= not a number")
     if not text:
         return ""
-    text = NANOMETRES.sub(_small, text)
-    text = MICROMETRES.sub(lambda m: f"{1e6 * float(m[1]):.4g} µm", text)
+    text = MICRO.sub(" µ", text)
     first = text.split()[0].rstrip(",:;.")
     return (text[0].upper() + text[1:] if first.isalpha() else text) + ("" if text.endswith((".", "?", "!")) else ".")
 

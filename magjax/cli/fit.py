@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from magjax.errors import ConfigurationError, MagjaxError
+from magjax.words import sized
 
 from .runtime import Progress, as_json, minutes, output_folder, parser, positive, prepare_jax, told
 from .scale import (
@@ -149,8 +150,9 @@ def run_fit(arguments) -> int:
         if text:
             print(f"\n{text}")
         for row in content["check"]:
-            expected = f", expected {row['expected_rms']:.3g}" if row["expected_rms"] else ""
-            print(f"  check {Path(row['file']).name}: rms {row['rms_after']:.3g} {row['unit']} (noise {row['noise_rms']:.3g}{expected})")
+            after, noise, expected = (sized(row["unit"], row[k] or 0.0) for k in ("rms_after", "noise_rms", "expected_rms"))
+            expected = f", expected {expected}" if row["expected_rms"] else ""
+            print(f"  check {Path(row['file']).name}: rms {after} (noise {noise}{expected})")
         if note := beyond_text(content["check"]):
             print(f"  {note}")
         for why in refused:

@@ -3,6 +3,7 @@
 import dataclasses
 
 from magjax.errors import ConfigurationError
+from magjax.words import sized
 
 from .runtime import Progress, as_json, output_folder, parser, prepare_jax, refuse_overwriting, told
 from .scale import add_where, executor_of
@@ -83,6 +84,7 @@ def run_simulate(arguments) -> int:
     prepare_jax()
     actuator, bench = _actuator(options)
     path = _target(options.out)
+    from magjax.plausibility import si_unit
     from magjax.simulate import MOST_PERIODS, TOLERANCE, signals_dataset, simulate
     from magjax.writers import write_dataset
 
@@ -100,7 +102,7 @@ def run_simulate(arguments) -> int:
         data = signals_dataset(signals, actuator, bench.name)
         write_dataset(path, data)
     stroke, settled = float(np.ptp(np.asarray(signals.reading))), not float(signals.unsettled) > TOLERANCE
-    text = f"peak to peak {stroke:.4g}; wrote {path}"
+    text = f"peak to peak {sized(si_unit(actuator.output), stroke, digits=4)}; wrote {path}"
     if not settled:
         text += f"; not settled: the last two of {MOST_PERIODS} periods still differ by {float(signals.unsettled):.1e} of the peak to peak"
     print(as_json({"file": str(path), "peak_to_peak": stroke, "settled": settled}) if options.json else text)

@@ -1,10 +1,13 @@
-"""What an oracle that knows the law and the bench could see: `python -m tests.blind.oracle test` writes ORACLE.json.
+"""What an oracle that knows the law and the bench could see: `python -m tests.blind.oracle test [--rivals]` adds to ORACLE.json, or RIVALS.json.
 
 The oracle's z of a concealed effect is the length of its noise-free trace d after everything that the base model could take up:
     z^2 = d' (sigma^2 I + A P A')^-1 d,
 A the tangent of the base at the truth (R_eddy, f0, xi, an offset of M, the density on hats in mean and coercive field, a mechanical
 transient a recording), P a wide prior on each. Tangents of the density are taken with the plays frozen: dH + K dB/dt = 0 with
 dM = D(t) + g(t) dH, D the hat's own magnetization and g = dM/dH.
+
+What the oracle sees of a single effect beyond its nearest rival is z sqrt(1 - c^2), c the cosine of the two traces in that metric, the rival's
+law and sizes known but for its amplitude. Where that is small the two cannot be told apart; a rival with shapes of its own may come nearer.
 """
 
 import argparse
@@ -19,8 +22,10 @@ from .generator.instruments import PERIODS
 from .generator.rod import response
 from .generator.sensor import beside
 from .generator.strain import FULL, M_S
+from .strengths import VISIBLE
 
 FILE = Path(__file__).with_name("ORACLE.json")
+RIVALS = Path(__file__).with_name("RIVALS.json")
 STEPS = 250
 MEAN_KNOTS = np.linspace(-2.4e4, 3.2e4, 17)
 COERCIVE_KNOTS = 1.6e4 * (np.arange(13) / 12) ** 1.6
@@ -69,6 +74,17 @@ class Sight:
     def z(self, trace) -> float:
         """Standard deviations by which a trace stands out."""
         return float(np.sqrt(max(trace @ self.remove(trace), 0.0)))
+
+    def nearest_rival(self, name, size) -> tuple[str, float]:
+        """The other effect, of middling size, that looks most like one of this size, and the z that is left of that beyond it."""
+        own = self.trace({name: size})
+        seen, left = self.remove(own), {}
+        for rival, sizes in VISIBLE.items():
+            if rival != name:
+                other = self.trace({rival: sizes[1]})
+                common = (other @ seen) ** 2 / max(other @ self.remove(other), 1e-30)
+                left[rival] = float(np.sqrt(max(own @ seen - common, 0.0)))
+        return min(left.items(), key=lambda row: row[1])
 
     def _tile(self, y):
         return np.tile(y, (1, PERIODS)).ravel()
@@ -142,19 +158,25 @@ def _place(x, knots):
 
 
 def main():
-    """z of every effect of every case of a suite, added to ORACLE.json."""
+    """z of every effect of every case of a suite, added to ORACLE.json; or what is left of single ones beyond the nearest rival."""
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("suite", choices=list(SUITES))
+    p.add_argument("--rivals", action="store_true")
     options = p.parse_args()
-    known = json.loads(FILE.read_text()) if FILE.exists() else {}
+    file = RIVALS if options.rivals else FILE
+    known = json.loads(file.read_text()) if file.exists() else {}
     for k in range(size(options.suite)):
         case = make_case(options.suite, k)
-        if case.name in known or not case.effects:
+        if case.name in known or not case.effects or (options.rivals and case.kind != "single"):
             continue
         sight = Sight(case)
-        known[case.name] = {n: round(sight.z(sight.trace({n: s})), 1) for n, s in case.effects.items()}
-        print(case.name, case.level, known[case.name], flush=True)
-        FILE.write_text(json.dumps(known, indent=0, sort_keys=True) + "\n")
+        if options.rivals:
+            rival, left = sight.nearest_rival(*next(iter(case.effects.items())))
+            known[case.name] = {rival: round(left, 1)}
+        else:
+            known[case.name] = {n: round(sight.z(sight.trace({n: s})), 1) for n, s in case.effects.items()}
+        print(case.name, case.level, list(case.effects), known[case.name], flush=True)
+        file.write_text(json.dumps(known, indent=0, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":
