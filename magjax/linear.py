@@ -14,6 +14,19 @@ def inverse_of(matrix):
     return jnp.linalg.inv(matrix)
 
 
+def inverse_of_definite(matrix):
+    """The inverse of a small (n, n) that is a positive definite one with its columns scaled, by Gauss-Jordan steps: these need no
+    pivots, and a batch is a matter of plain arithmetic, where LAPACK is called for one matrix after another."""
+    n = matrix.shape[0]
+    for k in range(n):
+        pivot, here = 1 / matrix[k, k], jnp.arange(n) == k
+        row, column = matrix[k] * pivot, matrix[:, k] * pivot
+        swept = matrix - matrix[:, k, None] * row
+        swept = jnp.where(here[:, None], row, jnp.where(here, -column[:, None], swept))
+        matrix = jnp.where(here[:, None] & here, pivot, swept)
+    return matrix
+
+
 TERMS = 14  # of the series: 0.5^15 / 15! is below rounding
 MOST_SQUARINGS = 40  # a norm of 2^39
 

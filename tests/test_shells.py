@@ -11,6 +11,7 @@ import magjax.effects as effects
 from magjax.chain.march import magnetize
 from magjax.chain.shells import distribution, march_shells
 from magjax.constants import MU0
+from magjax.linear import inverse_of_definite
 from magjax.preisach.memory import apply_field
 from magjax.simulate import run_chain, simulate
 from tests.test_simulate import actuator, sine
@@ -28,6 +29,15 @@ def test_the_matrix_is_that_of_a_cylinder():
         box = (i / 3, (i + 1) / 3, j / 3, (j + 1) / 3)
         whole = dblquad(lambda y, x: -2 * np.log(max(x, y, 1e-300)), *box, epsabs=1e-5)[0]
         assert D[i, j] == pytest.approx(9 * whole, abs=2e-3)
+
+
+def test_inverses_of_a_batch_need_no_pivots():
+    rng = np.random.default_rng(0)
+    B = rng.normal(size=(50, 4, 4))
+    matrices = (B @ B.swapaxes(1, 2) + 1e-3 * np.eye(4)) * 10 ** rng.uniform(-2, 3, (50, 1, 4))  # columns scaled
+    found = jax.vmap(inverse_of_definite)(jnp.asarray(matrices))
+    assert np.abs(matrices @ found - np.eye(4)).max() < 1e-10
+    assert inverse_of_definite(jnp.array([[4.0]])) == 0.25
 
 
 BESIDE = {

@@ -21,7 +21,7 @@ from jax.lax import stop_gradient
 
 from ..constants import MU0
 from ..effects.base import Trial
-from ..linear import inverse_of
+from ..linear import inverse_of_definite
 from ..preisach.memory import apply_field, branch_magnetization
 from .closed_form import slope_of
 from .coupled import March, _settle, run_march
@@ -161,7 +161,7 @@ def again_in_shells(rod: _Rod, actuator, c, drive, branch, corner):
 
     (loss, shift, added), (d_loss, d_shift, d_added) = jax.jvp(terms, (v, m), (jnp.ones_like(v), along))
     matrix = jnp.diag(rod.p0 * (1 + d_shift) + d_loss) + rod.Q * (1 + d_shift + along + d_added)
-    change = -inverse_of(stop_gradient(matrix)) @ (rod.p0 * (v + shift) + loss + rod.Q @ (v + shift + m + added) - rhs)
+    change = -inverse_of_definite(stop_gradient(matrix)) @ (rod.p0 * (v + shift) + loss + rod.Q @ (v + shift + m + added) - rhs)
     v, m = v + change, m + along * change
     return v, m, lambda memory: rod.after(c, drive, v, m, memory, 0.0)
 
@@ -203,7 +203,7 @@ def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
         along = jnp.sum(F * rise * step)  # of the potential whose gradient F is: above zero the minimum was passed
         good = (along <= OVERSHOOT * descent) | (scale < 1e-6)
         v = jnp.where(good, v + scale * step, v)
-        fresh = -inverse_of(J) @ F
+        fresh = -inverse_of_definite(J) @ F
         step, descent = jnp.where(good, fresh, step), jnp.where(good, -jnp.sum(F * rise * fresh), descent)
         return v, step, descent, jnp.where(good, 1.0, 0.5 * scale), jnp.where(good, jnp.max(jnp.abs(F)), jnp.inf), number + 1
 
@@ -215,7 +215,7 @@ def _solve(table, c, effects, actuator, trial_of, current, p0, Q, rhs):
 
     walk = tied((start, jnp.zeros_like(start), jnp.zeros(()), jnp.ones(()), jnp.full((), jnp.inf), 0), start)
     v = stop_gradient(jax.lax.while_loop(unsettled, refine, walk)[0])
-    inverse = stop_gradient(inverse_of(misfit(v)[1]))
+    inverse = stop_gradient(inverse_of_definite(misfit(v)[1]))
     _, slope, rising, kept = stop_gradient(_relays(fixed[0], fixed[1].memory, v))
 
     def live(memory, rising, kept, v):
