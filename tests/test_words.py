@@ -5,6 +5,7 @@ import math
 import pytest
 
 from fitting.diagnosis import unusable
+from fitting.report.banner import headline
 from magjax.words import sized
 
 
@@ -39,3 +40,9 @@ def test_the_same_error_of_many_files_is_said_once():
     two = unusable([several[0], "fit_05.csv: displacement is infinite at sample 3", several[1]])
     assert two.message == f"{several[0]} (the same of fit_01.csv). fit_05.csv: displacement is infinite at sample 3."
     assert two.data_problem == several[0]
+
+
+@pytest.mark.parametrize(("count", "named"), [(1, "fit_00.csv"), (3, "fit_00.csv and fit_01.csv and fit_02.csv"), (9, "fit_00.csv and 8 other files")])
+def test_the_headline_names_all_that_share_an_error(count, named):
+    found = unusable([f"fit_{k:02d}.csv: displacement is infinite at sample {k}" for k in range(count)])
+    assert headline(found.as_dict()).startswith(f"{named} must be mended first")

@@ -16,6 +16,7 @@ TONES = {
     "data_problem": "bad",
 }
 FILE = re.compile(r"(?:^|[.] )((?:(?![.] )[^:])+?[.][A-Za-z]\w*): ")  # that an error begins with
+FILES_TOO = re.compile(r" \(the same of ([^()]+)\)[.]")  # those that share it
 FORETOLD = 1.4  # times its noise, up to which a check recording is foretold
 AS_EXPECTED = 1.5  # times what the model expects its error to be
 
@@ -90,7 +91,8 @@ def _at_fault(found) -> str:
     """What a data problem asks to be mended."""
     text = f"{found['message']} {found['data_problem'] or ''}"
     bench = "[columns" in text or "bench file" in text
-    files = list(dict.fromkeys(Path(name).name for name in FILE.findall(text)))
+    files = [name for told in FILES_TOO.findall(text) for name in told.split(" and ")]
+    files = list(dict.fromkeys(Path(name).name for name in (*FILE.findall(text), *files)))
     if bench and (files or "leave it out" in text):
         return "The recordings or the bench file"
     return "The bench file" if bench else " and ".join(files) or "The recordings"
