@@ -26,7 +26,7 @@ from .finer import finest
 from .foretold import Foreteller
 from .rows import SLOW
 from .screen import screened
-from .task import Late
+from .task import Late, periods_from
 from .together import let_go
 from .trials import try_all
 from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
@@ -82,7 +82,7 @@ def search(task, base, candidates, check=(), ends=lambda current: False, free_me
     state = Reached(base, [], {}, foretell=Foreteller(check, base))
     scored = {c.name: c for c in candidates}
     any_rest = task.choices.rest == "auto"  # that of the base was chosen under its misfit
-    task = task.on(choices=base.choices)  # its density may be finer than the default: rivals get the same
+    task = task.on(choices=dataclasses.replace(base.choices, periods=periods_from(base)))  # its density may be finer than the default: rivals get the same
     try:
         task, made_up, needless = _forward(task, base, state, candidates, any_rest, check, ends, free_means)
         state.under_way = {}

@@ -8,6 +8,7 @@ import numpy as np
 
 from magjax.bench import Bench
 
+from .finer import REFINE_BELOW
 from .fit import fit_or_stop
 from .setup import Choices, effect_parameters
 
@@ -15,6 +16,12 @@ from .setup import Choices, effect_parameters
 def freed_beyond(result) -> tuple[str, ...]:
     """Names of what a fit frees beyond its bench file: effects' parameters, a sensor's zero."""
     return tuple(n for n in result.problem.layout.names if n not in result.bench.free)
+
+
+def periods_from(result):
+    """Periods that a fit begins with which goes on from another: those of that one. Where physics is missing its model may have been led to
+    a loss that takes many to settle, which an effect makes needless: there with the fewest, and it goes on with more where it takes them."""
+    return Choices().periods if result.chi2_per_sample > REFINE_BELOW else result.choices.periods
 
 
 LATE = 0.6  # of the time, after which nothing is begun anew
@@ -91,5 +98,7 @@ class Task:
         return fit_or_stop(self.recordings, self.bench, actuator=actuator, **{**usual, **more})
 
     def fit_on(self, start, actuator=None, **more):
-        """`fit` from where another fit of the same recordings ended, on its spectra, without another density."""
-        return self.fit(actuator, **{"start": start, "spectra": start.spectra, "refine": False, **more})
+        """`fit` from where another fit of the same recordings ended, on its spectra, without another density; as `periods_from` it,
+        where no choices are given."""
+        usual = {"choices": dataclasses.replace(self.choices, periods=periods_from(start))}
+        return self.fit(actuator, **{**usual, "start": start, "spectra": start.spectra, "refine": False, **more})

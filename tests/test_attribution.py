@@ -202,7 +202,7 @@ def test_the_search_leaves_out_rivals_that_it_has_found(monkeypatch):
         return task, None, True
 
     monkeypatch.setattr(fitting.search, "_forward", forward)
-    found = fitting.search.search(Task((), None), SimpleNamespace(choices=Choices()), [])
+    found = fitting.search.search(Task((), None), SimpleNamespace(choices=Choices(), chi2_per_sample=121.0), [])
     assert [names(rivals) for _, rivals, *_ in found.steps] == [["amplifier_clipping"], ["coulomb_friction"]]
 
 

@@ -13,6 +13,7 @@ from fitting.fit import fit
 from fitting.model import predicted_lines
 from fitting.settling import LADDER, left, periods_asked
 from fitting.setup import Choices, build_problem, spectra_of
+from fitting.task import Task
 from magjax.bench import load_bench
 
 
@@ -127,3 +128,15 @@ def test_a_rod_that_lags_by_more_than_a_period(monkeypatch):
         again = fit(recordings, near, actuator=short.actuator, choices=short.choices, start=short, refine=False, target=target)
         assert (np.max(again.choices.periods) > 3) == longer
         assert (again.chi2_per_sample < 0.7 * short.chi2_per_sample) == longer
+
+
+@pytest.mark.parametrize(("chi2n", "periods"), [(1200.0, 3), (2.0, (3, 24))], ids=["physics is missing", "near the noise"])
+def test_a_fit_that_goes_on_from_a_model_led_astray_begins_with_the_fewest_periods(monkeypatch, chi2n, periods):
+    """A plain fit of a rod in shells at 1272 times its noise was led to a loss that took 24 periods; with these every later fit took its time."""
+    begun = []
+    monkeypatch.setattr("fitting.task.fit_or_stop", lambda *given, **how: begun.append(how["choices"].periods))
+    start = SimpleNamespace(chi2_per_sample=chi2n, choices=Choices(periods=(3, 24)), spectra=())
+    task = Task((), None)
+    task.fit_on(start)
+    task.fit_on(start, choices=start.choices)  # as it is told
+    assert begun == [periods, (3, 24)]
