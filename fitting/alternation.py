@@ -10,6 +10,9 @@ import dataclasses
 
 import numpy as np
 
+from magjax.plausibility import si_unit
+from magjax.words import sized
+
 from .spectra import evaluate_lines
 
 RATIO = 6.0  # mean square of the alternation over what noise leaves in it
@@ -19,18 +22,19 @@ RECORDINGS = 0.9  # of the recordings must show it: a hum falls between the harm
 @dataclasses.dataclass(frozen=True)
 class Alternation:
     """What alternates from period to period: `size` relative to the reading's departure from its mean with `stderr`,
-    `share` of the alternation that this proportion and a constant explain, rms (unit of the reading), recordings without it."""
+    `share` of the alternation that this proportion and a constant explain, rms in the `unit` of the reading, recordings without it."""
 
     size: float
     stderr: float
     share: float
     rms: float
+    unit: str
     ratio: float
     cleaned: tuple = dataclasses.field(repr=False)
 
     def told(self, found):
         """The verdict on recordings without it, as the verdict on the recordings as they are."""
-        size = f"by {abs(self.size):.2g} of the motion" if self.share > 0.5 else f"by {self.rms:.3g} rms"
+        size = f"by {abs(self.size):.2g} of the motion" if self.share > 0.5 else f"by {sized(self.unit, self.rms)} rms"
         text = (
             f"every second period differs {size}: a subharmonic of the drive, which no effect of the catalogue makes. It asks for an oscillator "
             "that is not linear: look for play, rattle or impact in the mechanics."
@@ -77,5 +81,5 @@ def alternating(recordings, spectra, output: str) -> Alternation | None:
         return None
     rms = float(np.sqrt(power / sum(int(s.samples / s.periods) for s in spectra)))
     return Alternation(
-        float(top / bottom), float(1 / np.sqrt(bottom)), float(1 - left / power), rms, float(np.median(seen)), tuple(cleaned)
+        float(top / bottom), float(1 / np.sqrt(bottom)), float(1 - left / power), rms, si_unit(output), float(np.median(seen)), tuple(cleaned)
     )

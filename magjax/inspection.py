@@ -67,7 +67,7 @@ def inspect(recording, bench) -> Card:
     f = recording.frequency()
     facts, problems, warnings = {}, [], []
     facts["samples"] = f"{len(x)} at {recording.dt:.6g} s ({len(x) * recording.dt:.4g} s)"
-    facts["drive"] = f"{bench.drive} {x.min():.5g} .. {x.max():.5g}"
+    facts["drive"] = f"{bench.drive} {x.min():.5g} .. {x.max():.5g} {DRIVE_UNITS[bench.drive]}"
     facts["reading"] = f"{bench.output} {sized(si_unit(bench.output), y.min(), y.max(), digits=5, joined=' .. ')}"
     for name, v in ((bench.drive, x), (bench.output, y)):
         step = quantum(v)

@@ -13,4 +13,5 @@ def sized(unit: str, *values: float, digits: int = 3, joined: str = " -> ") -> s
     if unit in PREFIXED and largest > 0:
         rounded = float(f"{largest:.{digits}g}")
         prefix, factor = next(((p, f) for p, f in PREFIXES.items() if rounded >= f), ("p", 1e-12))
-    return joined.join(f"{v / factor:.{digits}g}" for v in values) + ("" if unit == "1" else f" {prefix}{unit}")
+    told = joined.join(f"{v / factor:.{digits}g}" for v in values)
+    return told if unit in ("", "1") else f"{told} {prefix}{unit}"

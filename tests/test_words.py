@@ -23,6 +23,7 @@ from magjax.words import sized
         ("T", (2.7e-3,), "2.7 mT"),
         ("A/m", (1234.0,), "1.23e+03 A/m"),
         ("1", (3.56e-6,), "3.56e-06"),
+        ("", (0.5,), "0.5"),
     ],
 )
 def test_a_size_is_told_by_the_prefix_that_suits_it(unit, values, told):

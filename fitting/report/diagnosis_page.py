@@ -7,7 +7,7 @@ import re
 from . import found as pictures
 from . import learned, loops, misfit, plane, tables
 from .banner import headline, spoken, tone
-from .fit_page import AT_NOISE, DEFINED, bounds_of, convergence_part, headed, residual_section, sentence, validity
+from .fit_page import AT_NOISE, DEFINED, FAR, bounds_of, convergence_part, headed, residual_section, sentence, validity
 from .page import Sketch, part, section
 from .residuals import repeating
 from .style import percent, plain, scale_of, terms_in, unit_text, words
@@ -125,7 +125,8 @@ def _groups(found, facts):
             why = tie["why"] or ("the best" if name in ties else "")
             row += [plain(tie["chi2_per_sample"]), said_of(why)] if ties else []
             rows.append([*row, about.get("signature", "")])
-    whole = found["verdict"] != "unknown_at"  # else something is left that none of them explains
+    left = (found["repaired"] or {}).get("chi2_per_sample") or 0.0
+    whole = found["verdict"] != "unknown_at" and left < FAR  # else something is left that none of them explains
     does = "Each of these repairs the model" if whole else "Each of these takes the same part of the misfit"
     text = f"{does}, and to name one from these recordings would be a guess."
     text += " Why each is not told from the best stands beside it; χ²/N is that of a fit with it." if ties else ""

@@ -356,9 +356,11 @@ def test_each_rival_says_why_it_is_not_told_from_the_best(folders, tmp_path):
     assert "about as well as the others" not in page
 
 
-def test_a_group_beside_an_unknown_repairs_nothing(folders, tmp_path):
+def test_a_group_beside_an_unknown_or_a_misfit_repairs_nothing(folders, tmp_path):
     found = json.loads((folders["group"] / "diagnosis.json").read_text())
-    for verdict, does in (("group", "repairs the model"), ("unknown_at", "takes the same part of the misfit")):
+    part = "takes the same part of the misfit"
+    for verdict, left, does in (("group", 1.03, "repairs the model"), ("group", 7.7, part), ("unknown_at", 1.03, part)):
+        found["repaired"]["chi2_per_sample"] = left
         unknown = {"block": "sensor", "region": "", "explained_share": 0.5} if verdict == "unknown_at" else None
         (tmp_path / "diagnosis.json").write_text(json.dumps({**found, "verdict": verdict, "unknown": unknown}))
         assert f"Each of these {does}, and to name one" in rebuild(tmp_path).read_text(encoding="utf-8")
