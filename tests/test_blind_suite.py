@@ -18,7 +18,7 @@ from tests.blind.generator.density import KINDS, SPAN, PlayDensity
 from tests.blind.generator.instruments import record
 from tests.blind.generator.strain import settled_play
 from tests.blind.oracle import FILE as ORACLE
-from tests.blind.oracle import Sight
+from tests.blind.oracle import RIVALS, Sight
 from tests.blind.run import diagnose, run_cases
 from tests.blind.score import coverage, judge, kept_line, read, read_all, table, wilson
 from tests.blind.strengths import GROUPS, HIDDEN, OUTSIDE, VISIBLE
@@ -168,14 +168,34 @@ def test_the_table_tells_by_what_the_oracle_saw():
     cases = [c for c in (make_case("test", k) for k in range(size("test"))) if c.name in seen and c.kind in ("single", "pair")]
     found = {"verdict": "attributed", "groups": [], "absorbed": [], "check": [], "unknown": None}
     rows = [
-        (c, found | {"effects": [{"name": n, "confidence": 0.95} for n, z in seen[c.name].items() if z >= 10]}, {"status": 0, "seconds": 1.0})
+        (
+            c,
+            found | {"effects": [{"name": n, "confidence": 0.95} for n, z in seen[c.name].items() if z >= 10]},
+            {"status": 0, "seconds": 1.0},
+        )
         for c in cases
     ]
     text = table("test", rows)
     for kind in ("single", "pair"):
         clear = sum(c.kind == kind and min(seen[c.name].values()) >= 10 for c in cases)
-        assert f"at z = 10 or more, {kind}s: right or in a group {clear}/{clear}: " in text
+        assert f"{kind}s of z = 10 or more: right or in a group {clear}/{clear}: " in text
     assert "| 0 to 5 | 2 | 0 | 0 | 0 | 0 | 2 | 0/2: " in text  # pairs of which one cannot be seen
+
+
+def test_the_table_tells_what_stands_out_from_its_nearest_rival():
+    """Two names where one would do count as a group, and only what the oracle tells from its nearest rival is asked for."""
+    left = json.loads(RIVALS.read_text())
+    cases = [c for c in (make_case("test", k) for k in range(size("test"))) if c.kind == "single"]
+    assert {c.name for c in cases} == set(left)
+    apart = [c for c in cases if min(left[c.name].values()) >= 5]
+    assert 0 < len(apart) < len(cases)
+    said = {"verdict": "attributed", "groups": [], "absorbed": [], "check": [], "unknown": None}
+    rows = [
+        (c, said | {"effects": [{"name": n, "confidence": 0.95} for n in c.effects]}, {"status": 0, "seconds": 1.0}) for c in cases
+    ]
+    grouped = said | {"verdict": "group", "effects": [], "groups": [[*apart[0].effects, "linear_strain"]]}
+    rows[cases.index(apart[0])] = (apart[0], grouped, {"status": 0, "seconds": 1.0})
+    assert f"beyond their nearest rival: exactly named {len(apart) - 1}/{len(apart)}: " in table("test", rows)
 
 
 @pytest.fixture(scope="module")

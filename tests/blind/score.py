@@ -19,6 +19,7 @@ import numpy as np
 
 from .cases import SUITES, block_outside, make_case, seal, size
 from .oracle import FILE as ORACLE
+from .oracle import RIVALS
 from .run import GENERATOR_FAILED
 from .strengths import GROUPS
 
@@ -243,31 +244,50 @@ def _believed(rows) -> list[str]:
 
 
 SEEN = 10.0  # an oracle's z from which the targets of the proof ask for a name
+APART = 5.0  # and its z beyond the nearest rival, from which they ask for the one name
 
 
 def _by_sight(rows):
-    """Singles, and pairs by the lesser of the two, by what the oracle could see, and what the targets of the proof ask for."""
-    seen = json.loads(ORACLE.read_text()) if ORACLE.exists() else {}
-    lines = []
-    for kind, title in (("single", "single, oracle z"), ("pair", "pair, lesser oracle z")):
-        known = [(min(seen[c.name].values()), judge(c, d, done["status"])) for c, d, done in rows if c.kind == kind and c.name in seen]
-        if not known:
-            continue
-        lines += ["", f"| {title} | cases | right | group | kin | silent | other | right or group, 95 % |", "|---|" + "---|" * 7]
-        for low, high in itertools.pairwise((0.0, 5.0, SEEN, 30.0, 100.0, np.inf)):
-            if got := [outcome for z, outcome in known if low <= z < high]:
-                n = [got.count(w) for w in ("right", "group", "kin", "silent")]
-                cells = " | ".join(map(str, [*n, len(got) - sum(n)]))
-                band = f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
-                lines.append(f"| {band} | {len(got)} | {cells} | {_share(got)} |")
-        if got := [outcome for z, outcome in known if z >= SEEN]:
-            lines += ["", f"Seen by the oracle at z = {SEEN:g} or more, {kind}s: right or in a group {_share(got)}."]
+    """Singles, and pairs by the lesser of the two, by what the oracle could see; singles by what it sees beyond their nearest rival."""
+    seen, left = (json.loads(file.read_text()) if file.exists() else {} for file in (ORACLE, RIVALS))
+    named = ("right", "group")
+    return [
+        *_banded("single, oracle z", "single", seen, rows, named, f"singles of z = {SEEN:g} or more: right or in a group", SEEN),
+        *_banded("pair, lesser oracle z", "pair", seen, rows, named, f"pairs of z = {SEEN:g} or more: right or in a group", SEEN),
+        *_banded(
+            "single, z beyond the nearest rival",
+            "single",
+            left,
+            rows,
+            ("right",),
+            f"singles of z = {APART:g} or more beyond their nearest rival: exactly named",
+            APART,
+        ),
+    ]
+
+
+def _banded(title, kind, sight, rows, as_good, said, least):
+    """A table of outcomes by the least z that `sight` tells of a case, and the share that is as good as is asked for from `least` on."""
+    known = [
+        (min(sight[c.name].values()), judge(c, d, done["status"])) for c, d, done in rows if c.kind == kind and c.name in sight
+    ]
+    if not known:
+        return []
+    lines = ["", f"| {title} | cases | right | group | kin | silent | other | {' or '.join(as_good)}, 95 % |", "|---|" + "---|" * 7]
+    for low, high in itertools.pairwise((0.0, 5.0, 10.0, 30.0, 100.0, np.inf)):
+        if got := [outcome for z, outcome in known if low <= z < high]:
+            n = [got.count(w) for w in ("right", "group", "kin", "silent")]
+            cells = " | ".join(map(str, [*n, len(got) - sum(n)]))
+            band = f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
+            lines.append(f"| {band} | {len(got)} | {cells} | {_share(got, as_good)} |")
+    if got := [outcome for z, outcome in known if z >= least]:
+        lines += ["", f"Seen by the oracle, {said} {_share(got, as_good)}."]
     return lines
 
 
-def _share(outcomes) -> str:
-    """How many are right or in a group, with its interval."""
-    good = sum(o in ("right", "group") for o in outcomes)
+def _share(outcomes, as_good=("right", "group")) -> str:
+    """How many are as good as is asked for, with its interval."""
+    good = sum(o in as_good for o in outcomes)
     low, high = wilson(good, len(outcomes))
     return f"{good}/{len(outcomes)}: {low:.0%} to {high:.0%}"
 
