@@ -170,19 +170,20 @@ def _highest_beside(result) -> float:
 
 
 def by_cells(task, evidence) -> Evidence | None:
-    """The same with masses of cells or finer hats in the final model, where they promise to foretell better; None elsewhere.
+    """The same with masses of cells, finer hats or the plain fit's steps in the final model, where they promise to foretell better;
+    None elsewhere.
 
-    After the verdict, for cells take up physics too, which hats leave for an effect to explain. By generalized
-    cross-validation: on densities that hats follow, cells lower chi2 and foretell far worse.
+    After the verdict, for cells take up physics too, which hats leave for an effect to explain, and so may steps that were found
+    without it. By generalized cross-validation: on densities that hats follow, cells lower chi2 and foretell far worse.
     """
     current, plain = evidence.reached.current, evidence.plain
-    if (
-        task.bench.drive != "current"
-        or not current.chi2_per_sample > FINER_FROM[1]
-        or (current is plain and evidence.raw is not plain)
-    ):
+    if task.bench.drive != "current" or (current is plain and evidence.raw is not plain):
         return None
-    densities = (*finer_hats(current.choices), *cells_beside(current.choices))
+    far = current.chi2_per_sample > FINER_FROM[1]
+    densities = (*finer_hats(current.choices), *cells_beside(current.choices)) if far else ()
+    if plain.choices.stiffness is not None and current.choices.stiffness is None:
+        steps = {n: getattr(plain.choices, n) for n in ("level", "knots", "cells", "stiffness")}
+        densities = (*densities, dataclasses.replace(current.choices, **steps))
     best = min(_fits_on(task, current, densities), key=_cross_validation, default=current)
     if not _cross_validation(best) < CELLS_BETTER * _cross_validation(current):
         return None

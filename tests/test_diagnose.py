@@ -322,6 +322,20 @@ def test_masses_of_cells_or_finer_hats_serve_a_final_model_where_they_promise_to
     assert sorted(asked, key=str) == [(cells, ("sensor.offset",)) for cells in fits] and (found and found.excess) == taken
 
 
+@pytest.mark.parametrize(("left", "unknowns", "taken"), [(0.95, 32.0, True), (0.98, 33.5, False), (0.95, 36.0, False)])
+def test_the_steps_of_the_plain_density_serve_beside_effects_where_they_promise_to_foretell_better(bench, monkeypatch, left, unknowns, taken):
+    """They were laid aside when effects were fitted; cells and finer hats are not asked for where little is left."""
+    plain, now, found = a_fit(1.07, 60.0), a_fit(0.98, 60.0, "excess_loss"), a_fit(left, 60.0, "excess_loss")
+    steps = Choices(knots=(26, 18), stiffness=object(), rest="positive")
+    plain.choices, now.choices, now.spectra, asked = steps, Choices(rest="negative"), (), []
+    now.unknowns, found.unknowns = 34.0, unknowns
+    now.bench, now.problem = bench, SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy",)))
+    monkeypatch.setattr(Task, "fit", lambda task, actuator, choices, **more: asked.append(choices) or found)
+    rewarded = rough_module.by_cells(Task((), bench), evidence_of([], plain, now, (), {}))
+    assert asked == [dataclasses.replace(steps, rest="negative")]
+    assert (rewarded is not None and rewarded.reached.current is found) == taken
+
+
 @pytest.mark.parametrize(
     ("chi2n", "cells", "beside", "rough"),
     [
