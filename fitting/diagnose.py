@@ -44,7 +44,7 @@ from .own_signals import (
 from .reach import BEYOND
 from .record_level import remove_from_checks
 from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance, worth_a_search
-from .rows import DRIFTS
+from .rows import DRIFTS, led_by_drifts
 from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
@@ -289,7 +289,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
         reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried), task.choices.only,
     )  # fmt: skip
-    found = with_zero(_concluded(task, evidence), zero, rival)
+    found = with_zero(_concluded(task, led_by_drifts(evidence)), zero, rival)
     return found if told is None else found.noted(MEMORY_TEXT.format(STATES[told.choices.rest]))
 
 

@@ -6,12 +6,12 @@ import numpy as np
 
 from magjax.effects import CLASSES
 
-from .attribute import UNCONFIRMED_TIE, chi2_of, confidence, tie_of
+from .attribute import SETTLED_CHI2, UNCONFIRMED_TIE, chi2_of, confidence, rivals_of, tie_of
 
 CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
 DRIFTS = ("zero_drift", "thermal_drift")
 SLOW = ("creep", "magnetic_aftereffect")  # effects that go on for longer than a recording
-GOES_ON = {"creep": 1.0, "magnetic_aftereffect": 2.0}  # times its amplitude, as a share of the mean reading, that a drift of it is less than
+GOES_ON = {"creep": 1.5, "magnetic_aftereffect": 2.0}  # decades of it, times its amplitude, as a share of the mean reading, that a drift of it is less than
 PARTIAL = 0.5  # most confidence in an effect of which not all rivals were fitted
 BEHIND = 5.0  # decades of a creep, that a mean may lack of its end
 
@@ -80,7 +80,7 @@ def ties_of(evidence) -> dict:
 
 def creeps_on(effect, evidence) -> str | None:
     """The slow effect that was found, where a drift within the records is that going on: all but a fifth of it to one side of the
-    mean displacement, away from where all came from, and less than a decade of a creep, or than all that is late of M makes of
+    mean displacement, away from where all came from, and less than `GOES_ON` decades of a creep, or than all that is late of M makes of
     its square; None elsewhere."""
     actuator = evidence.reached.current.actuator
     found = {best.name for best, *_ in evidence.reached.steps} & {e.name for e in actuator.effects}
@@ -94,6 +94,30 @@ def creeps_on(effect, evidence) -> str | None:
     late = actuator.effect(slow)
     most = GOES_ON[slow] * float(getattr(late, late.amplitude))
     return slow if after and np.all(np.abs(drifts) < most * np.abs(means)) else None
+
+
+def led_by_drifts(evidence):
+    """The evidence with a slow effect in place of the last that was found, where it met the noise there, too, the drifts within the
+    records are it going on, and they score higher than it was behind: the other one would need a drift beside it."""
+    reached = evidence.reached
+    drifts = [e for e, _ in evidence.adopted if e.name in DRIFTS and not e.shapes.get("zeros")]
+    if not drifts or not reached.steps or any(best.name in SLOW for best, *_ in reached.steps):
+        return evidence
+    best, _, good, before = reached.steps[-1]
+    if reached.current is not best.result:
+        return evidence
+
+    def led_by(t, tied=()):
+        steps = [*reached.steps[:-1], (t, tied, tied, before)]
+        return dataclasses.replace(evidence, reached=dataclasses.replace(reached, current=t.result, steps=steps))
+
+    spoken = max(e.z**2 for e in drifts)
+    near = [t for t in good if t.name in SLOW and t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
+    slow = [t for t in near if t.bic_change - best.bic_change < spoken and all(creeps_on(e, led_by(t)) for e in drifts)]
+    if not slow:
+        return evidence
+    first = min(slow, key=lambda t: t.bic_change)
+    return led_by(first, rivals_of(first, slow))
 
 
 def behind(effect, evidence) -> str | None:
