@@ -8,6 +8,7 @@ would add; neither asks for a program of its own.
 
 import dataclasses
 import itertools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.chain import Timeline
-from magjax.chain.march import DISTURBED, Steps, linearized
+from magjax.chain.march import AT_FIRST, DISTURBED, Steps, ends_taken, linearized
 from magjax.effects.base import AbstractEffect
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain
@@ -125,15 +126,17 @@ class Rows:
     """What every line of some recordings, (recordings, lines) of each array, asks of their marches and of what is read.
 
     `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (7, samples), see `SIGNALS`; `read`:
-    (parameters,), of those behind the march; `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older
-    places,), the same of the bottom of the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`:
-    (samples, 2), of applied field and current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see
+    (parameters,), of those behind the march; `taken`: the samples of the march at the ends of its steps, as all that follow
+    (`ends_taken`); `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom
+    of the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`: (samples, 2), of applied field and
+    current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see
     `magnetize`; `moving`: (parameters,), of those of the march; `mean`: (), of what is added to M of all samples.
     """
 
     marched: Marched
     signals: np.ndarray
     read: np.ndarray
+    taken: np.ndarray
     own: np.ndarray
     known: np.ndarray
     drive: np.ndarray
@@ -146,7 +149,7 @@ class Rows:
         steps, found = self.marched.steps, []
         for r, (maxima, minima) in enumerate(steps.corners):
             corners, relay = len(maxima), steps.relay_field[r]
-            fixed, field, rising = (x.ravel() for x in (steps.threshold[r], relay[1:], steps.rising[r]))
+            fixed, field, rising = (x.ravel() for x in (steps.threshold[r], relay[self.taken], steps.rising[r]))
             alpha = np.concatenate([np.where(rising, field, fixed), maxima, maxima])
             beta = np.concatenate([np.where(rising, fixed, field), [basis.low], minima[:-1], minima])
             sign = np.concatenate([np.where(rising, 2.0, -2.0), np.full(corners, 2.0), np.full(corners, -2.0)])
@@ -164,7 +167,7 @@ class Rows:
     def of_steps(self, *added) -> np.ndarray:
         """First-order change of the lines by what is added to every step, 3 of (columns, recordings, steps + 1) as `magnetize` has them, or
         None: (columns, recordings, lines)."""
-        return sum(np.einsum("rlt,crt->crl", self.disturbed[..., k], x[:, :, 1:], optimize=True) for k, x in enumerate(added) if x is not None)
+        return sum(np.einsum("rlt,crt->crl", self.disturbed[..., k], x[:, :, self.taken], optimize=True) for k, x in enumerate(added) if x is not None)
 
     def of_drive(self, change) -> np.ndarray:
         """The same by a change of the current, A, (columns, recordings, samples)."""
@@ -185,53 +188,162 @@ def as_lines(rows) -> np.ndarray:
 
 
 def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
-    """Led back through the marches, from the last step to the first; arguments as in `Rows`, in NumPy."""
-    steps, (number, lines, _, samples) = marched.steps, signals.shape
-    (count, shells), size, older = steps.place.shape[1:], steps.rest.shape[1], steps.moved.shape[1]
-    every = np.arange(number)
-    slopes = steps.slopes.swapaxes(2, 3)  # (recordings, steps, in, out)
-    cuts = np.cumsum([0, size, 2 * shells, shells + 2 + DISTURBED, slopes.shape[2] - size - 3 * shells - 2 - DISTURBED])
-    state, corners, added, moving = (slice(*ends) for ends in itertools.pairwise(cuts))
-    at = np.zeros((older + count, number, 2, shells, lines))  # field and M of every place
-    mean = signals[:, :, 1].sum(axis=-1)
-    relay = steps.relay_field[:, -samples:].mean(axis=2)
-    for end, slope in zip((relay.argmax(axis=1), relay.argmin(axis=1)), marched.unreached.T, strict=True):
-        at[older + count - samples + end, every, 0] += (slope[:, None] * mean)[:, None] / shells
-    asked = np.zeros((count, number, 3, lines))
-    asked[count - samples - 1 : -1] = np.moveaxis(signals[:, :, :3], (3, 2), (0, 2))
-    through, parameters = np.empty((count, number, added.stop - added.start, lines)), 0.0
-    marks = slice(size - steps.ended.shape[3], size)  # states of effects; what the end of a later period asks of them
-    later = np.zeros((number, steps.ended.shape[3], lines))
-    out, back = np.zeros((number, slopes.shape[3], lines)), np.empty((number, slopes.shape[2], lines))
-    for t in range(count - 1, -1, -1):
-        out[:, size:-3] = at[older + t].reshape(number, 2 * shells, lines)
-        out[:, -3:] = asked[t]
-        if (t + 1) % samples == 0:
-            out[:, marks] += later
-            later = steps.ended[:, t // samples].swapaxes(1, 2) @ out[:, :size]
-        np.matmul(slopes[:, t], out, out=back)
-        out[:, :size], through[t] = back[:, state], back[:, added]
-        left = back[:, corners].reshape(number, 2, shells, lines)
-        for s in range(shells):
-            at[steps.place[:, t, s], every, :, s] += left[:, :, s]
-        parameters = parameters + back[:, moving]
-    out[:, marks] += later
-    first = steps.rest.swapaxes(1, 2) @ out[:, :size]
-    at[older - 1, :, 1] += first[:, :shells]
-    known = at[:older].sum(axis=3)  # shells have the same before the first step
-    begin = first[:, shells : shells + 2]
-    begin[:, 0] += np.einsum("prkl,rpk->rl", known, steps.moved)
-    known = np.moveaxis(known[:, :, 1], 0, 2)
-    number_of = (older - 2) // 2
-    known[..., 2 * number_of] += known[..., older - 1]  # the last minimum is where the memory stands
-    for k in range(number_of - 1, -1, -1):  # a minimum is reached from its maximum, that from the minimum before it
-        known[..., 1 + k] += known[..., 1 + number_of + k]
-        known[..., number_of + k if k else 0] += known[..., 1 + k]
-    through = through.transpose(1, 3, 0, 2)  # (recordings, lines, steps, ...)
-    drive = through[:, :, :-1, shells : shells + 2]
-    drive = np.concatenate([begin.swapaxes(1, 2)[:, :, None], drive], axis=2).reshape(number, lines, -1, samples, 2).sum(axis=2)
-    drive[:, :, 0] += through[:, :, -1, shells : shells + 2]
-    own, disturbed = through[..., :shells], through[..., shells + 2 :]
-    moving = (parameters + first[:, shells + 2 :]).swapaxes(1, 2)
-    marched = dataclasses.replace(marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
-    return Rows(marched, signals, read, own, known[..., : older - 1], drive, disturbed, moving, mean)
+    """Led back through the marches, from the last step to the first; arguments as in `Rows`, in NumPy.
+
+    Where the last period stands for others, what it leaves for the one before is led through it again: by the few numbers that go
+    from period to period, X -> A X, of which the sum over all of them is led through the steps at once.
+    """
+    back = _Backward(marched, signals.shape[3])
+    asked = back.asked(signals)
+    passed = back.led(asked)
+    if not back.before:
+        return back.rows([passed], signals, read)
+    A, left = back.led(back.each()).left, passed.left
+    every = left
+    for _ in range(back.before - 1):
+        left = A @ left
+        every = every + left
+    last = back.led(back.entering(every, asked))
+    first = back.led(back.entering(A @ left, back.nothing(signals.shape[1]), last.at), first=True)
+    return back.rows([first, last], signals, read)
+
+
+class _Asked(NamedTuple):
+    """What is asked of some steps, for some lines: of (field H, M, its spread) after each, (steps, recordings, 3, lines), of
+    (field, M) of every place, (places, recordings, 2, shells, lines), of the state after the last step and of the states of effects at the
+    period before, (recordings, numbers, lines) each."""
+
+    after: np.ndarray
+    at: np.ndarray
+    state: np.ndarray
+    later: np.ndarray
+
+
+class _Passed(NamedTuple):
+    """What the lines ask of the steps, one by one: `through`, (steps, recordings, numbers, lines), and of parameters, (recordings,
+    parameters, lines); of all places, `at`, as in `_Asked`; and `left`, (recordings, numbers, lines), for the period before."""
+
+    through: np.ndarray
+    parameters: np.ndarray
+    at: np.ndarray
+    left: np.ndarray
+
+
+class _Backward:
+    """The steps of marches, to be gone through from the last to the first.
+
+    Where they are those of the first periods and the last, the last stands for `before` more between them. A state, what effects keep for
+    a period and the places from which branches leave a period later, `turned`, go from one period to the next. Places: older ones, those
+    of the steps, and those of the period before the last.
+    """
+
+    def __init__(self, marched, samples):
+        steps = marched.steps
+        self.marched, self.samples = marched, samples
+        self.number, self.count, self.shells = steps.place.shape
+        self.size, self.older, marks = steps.rest.shape[1], steps.moved.shape[1], steps.ended.shape[3]
+        self.slopes = steps.slopes.swapaxes(2, 3)  # (recordings, steps, in, out)
+        self.marks = slice(self.size - marks, self.size)  # states of effects, of which the end of a later period asks
+        total = steps.relay_field.shape[1] - 1
+        self.taken = ends_taken(total + 1, samples)
+        self.before, self.place, self.turned = (total - self.count) // samples, steps.place, np.zeros((self.number, 0), int)
+        self.first = AT_FIRST * samples if self.before else 0  # steps that are gone through by themselves
+        if self.before:
+            step, between = steps.place - self.older, np.zeros((self.number, samples), bool)  # step: of the whole march, at the corner
+            earlier = (step >= self.first) & (step < total - samples)
+            own = np.where(earlier, self.count + step % samples, step - np.where(step >= self.first, total - self.count, 0))
+            self.place = self.older + own
+            for k, there in enumerate(earlier):
+                between[k, step[k][there] % samples] = True
+            self.turned = np.argsort(~between, axis=1, kind="stable")[:, : between.sum(axis=1).max()]
+
+    def nothing(self, lines) -> _Asked:
+        """Room for what is asked."""
+        places, marks = self.older + self.count + (self.samples if self.before else 0), self.marks.stop - self.marks.start
+        shapes = (self.count, self.number, 3), (places, self.number, 2, self.shells), (self.number, self.size), (self.number, marks)
+        return _Asked(*(np.zeros((*shape, lines)) for shape in shapes))
+
+    def asked(self, signals) -> _Asked:
+        """What the lines ask of the last period."""
+        steps, asked, every = self.marched.steps, self.nothing(signals.shape[1]), np.arange(self.number)
+        relay, mean = steps.relay_field[:, -self.samples :].mean(axis=2), signals[:, :, 1].sum(axis=-1)
+        for end, slope in zip((relay.argmax(axis=1), relay.argmin(axis=1)), self.marched.unreached.T, strict=True):
+            asked.at[self.older + self.count - self.samples + end, every, 0] += (slope[:, None] * mean)[:, None] / self.shells
+        read = np.moveaxis(signals[:, :, :3], (3, 2), (0, 2))
+        if self.before:
+            asked.after[-self.samples :] = np.roll(read, -1, axis=0)  # the end of a period is its first sample
+        else:
+            asked.after[-self.samples - 1 : -1] = read
+        return asked
+
+    def entering(self, given, asked, at=0.0) -> _Asked:
+        """`asked`, and what the next period asks of this one, as `_Passed.left`, and of places; the last period where these are not given, else the first ones."""
+        before = self.first - (0 if np.isscalar(at) else self.samples)
+        asked = _Asked(asked.after, asked.at + at, asked.state.copy(), asked.later.copy())
+        state, later, turned = np.split(given, np.cumsum([self.size, asked.later.shape[1]]), axis=1)
+        asked.state[:] += state
+        asked.later[:] += later
+        turned = turned.reshape(self.number, self.turned.shape[1], 2, self.shells, given.shape[2])
+        for k, there in enumerate(self.turned):
+            asked.at[self.older + before + there, k] += turned[k]
+        return asked
+
+    def each(self) -> _Asked:
+        """Every number that goes from period to period, as lines."""
+        every = self.size + self.marks.stop - self.marks.start + 2 * self.shells * self.turned.shape[1]
+        return self.entering(np.broadcast_to(np.eye(every), (self.number, every, every)), self.nothing(every))
+
+    def led(self, asked: _Asked, first: bool = False) -> _Passed:
+        """From the last step to the first: through all, or the last period where it stands for others, or the `first` ones then."""
+        number, shells, size, slopes = self.number, self.shells, self.size, self.slopes
+        cuts = np.cumsum([0, size, 2 * shells, shells + 2 + DISTURBED, slopes.shape[2] - size - 3 * shells - 2 - DISTURBED])
+        state, corners, added, moving = (slice(*ends) for ends in itertools.pairwise(cuts))
+        lines, every, at, later = asked.after.shape[3], np.arange(number), asked.at.copy(), asked.later
+        begin, end = (0, self.first) if first else (self.first, self.count)
+        through, parameters = np.empty((end - begin, number, added.stop - added.start, lines)), 0.0
+        out, back = np.zeros((number, slopes.shape[3], lines)), np.empty((number, slopes.shape[2], lines))
+        out[:, :size] = asked.state
+        for t in range(end - 1, begin - 1, -1):
+            out[:, size:-3] = at[self.older + t].reshape(number, 2 * shells, lines)
+            out[:, -3:] = asked.after[t]
+            if (t + 1) % self.samples == 0:
+                out[:, self.marks] += later
+                later = self.marched.steps.ended[:, t // self.samples].swapaxes(1, 2) @ out[:, :size]
+            np.matmul(slopes[:, t], out, out=back)
+            out[:, :size], through[t - begin] = back[:, state], back[:, added]
+            left = back[:, corners].reshape(number, 2, shells, lines)
+            for s in range(shells):
+                at[self.place[:, t, s], every, :, s] += left[:, :, s]
+            parameters = parameters + back[:, moving]
+        turned = at[self.older + self.count + self.turned.T, every].swapaxes(0, 1)
+        turned = turned.reshape(number, 2 * shells * self.turned.shape[1], lines)
+        return _Passed(through, parameters, at, np.concatenate([out[:, :size], later, turned], axis=1))
+
+    def rows(self, passed, signals, read) -> Rows:
+        """What was led through the periods, the first one first, as `Rows`."""
+        steps, number, shells, size, older = self.marched.steps, self.number, self.shells, self.size, self.older
+        at, end = passed[0].at[:older].copy(), passed[0].left
+        out = end[:, :size].copy()
+        out[:, self.marks] += end[:, size : size + self.marks.stop - self.marks.start]
+        first = steps.rest.swapaxes(1, 2) @ out
+        at[older - 1, :, 1] += first[:, :shells]
+        known = at.sum(axis=3)  # shells have the same before the first step
+        begin = first[:, shells : shells + 2]
+        begin[:, 0] += np.einsum("prkl,rpk->rl", known, steps.moved)
+        known = np.moveaxis(known[:, :, 1], 0, 2)
+        number_of = (older - 2) // 2
+        known[..., 2 * number_of] += known[..., older - 1]  # the last minimum is where the memory stands
+        for k in range(number_of - 1, -1, -1):  # a minimum is reached from its maximum, that from the minimum before it
+            known[..., 1 + k] += known[..., 1 + number_of + k]
+            known[..., number_of + k if k else 0] += known[..., 1 + k]
+        through = np.concatenate([p.through for p in passed]) if len(passed) > 1 else passed[0].through
+        through = through.transpose(1, 3, 0, 2)  # (recordings, lines, steps, ...)
+        drive = through[:, :, :-1, shells : shells + 2]
+        drive = np.concatenate([begin.swapaxes(1, 2)[:, :, None], drive], axis=2)
+        drive = drive.reshape(number, signals.shape[1], -1, self.samples, 2).sum(axis=2)
+        drive[:, :, 0] += through[:, :, -1, shells : shells + 2]
+        own, disturbed = through[..., :shells], through[..., shells + 2 :]
+        moving = (sum(p.parameters for p in passed) + first[:, shells + 2 :]).swapaxes(1, 2)
+        mean = signals[:, :, 1].sum(axis=-1)
+        marched = dataclasses.replace(self.marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
+        return Rows(marched, signals, read, self.taken, own, known[..., : older - 1], drive, disturbed, moving, mean)

@@ -72,14 +72,16 @@ def test_they_are_those_of_the_whole_chain(rest):
         assert len(drive) == len(H) == len(M) and drive == pytest.approx(s.drive_at(np.arange(len(drive)) / len(drive)))
 
 
-def along_some_directions(*held):
+def along_some_directions(*held, R_eddy=None, **choices):
     """The change of the misfit along some directions of all unknowns, (directions, data): by the Jacobian, and by the whole chain."""
     actuator = load_bench("aa-050h").actuator()
     for effect in held:
         actuator = actuator.with_effect(effect)
-    problem, z = problem_of(some(20, 200), actuator, rest="demagnetized")
+    problem, z = problem_of(some(20, 200), actuator, rest="demagnetized", **choices)
     rng = np.random.default_rng(3)
     z = z + rng.uniform(0, 0.01, len(z))
+    if R_eddy:
+        z[problem.layout.index("coil.R_eddy")] = problem.layout.coordinate("coil.R_eddy", R_eddy)
     layout, coarse = problem.layout, problem.predictors[0]
 
     @jax.jit
@@ -113,6 +115,23 @@ def test_so_they_are_of_states_that_are_led_to_where_they_repeat(effect):
     largest = np.abs(expected).max(axis=1)
     assert largest.min() > 0
     assert np.all(np.abs(found - expected).max(axis=1) < 1e-8 * largest)
+
+
+@pytest.mark.parametrize(
+    ("held", "periods", "R_eddy", "near"),
+    [
+        ((), 8, 70.0, 1e-6),
+        pytest.param((), 24, 25.0, 1e-4, marks=pytest.mark.long),
+        pytest.param((effects.FieldDiffusion(kappa=0.7),), 24, 70.0, 1e-4, marks=pytest.mark.long),
+        pytest.param((effects.FieldDiffusion(kappa=0.7), effects.MagneticAftereffect(share=0.02)), 14, 70.0, 1e-4, marks=pytest.mark.long),
+    ],
+)
+def test_so_they_are_of_many_periods_of_which_few_are_gone_through(held, periods, R_eddy, near):
+    """The last period stands for all but the first ones, also where it has settled to rounding long before."""
+    found, expected = along_some_directions(*held, periods=periods, R_eddy=R_eddy)
+    largest = np.abs(expected).max(axis=1)
+    assert largest.min() > 0
+    assert np.all(np.abs(found - expected).max(axis=1) < near * largest)
 
 
 @pytest.mark.long

@@ -21,8 +21,9 @@ def solve_frozen(table, memory: Memory, p, q, rhs):
     up = jnp.sum(p * memory.maxima + q * memory.m_maxima > rhs)
     down = jnp.sum(p * memory.minima + q * memory.m_minima < rhs)
     kept = jnp.where(rising, up, down)
-    v, m = _locate(table, memory.select(table, rising, kept), p, q, rhs)
-    return v, m, rising, kept
+    branch = memory.select(table, rising, kept)
+    v, m = _locate(table, branch, p, q, rhs)
+    return v, m, rising, branch[1]
 
 
 @jax.custom_jvp

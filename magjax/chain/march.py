@@ -136,10 +136,18 @@ class _Known(NamedTuple):
     along: jax.Array
 
 
-def _known(table, memory: Memory, fields) -> _Known:
-    """The branches of a march through these relay fields; derivatives of the table go into `base`."""
+def _known(table, memory: Memory, fields, period: int = 0) -> _Known:
+    """The branches of a march through these relay fields; derivatives of the table go into `base`. `period`: of a long march, every one
+    of which is taken to go a little beyond the one before: where it only comes back to its turning points, rounding would tell."""
     frozen, v = stop_gradient(table), fields[1:]
-    rising, place, threshold = stop_gradient(_branches(frozen, stop_gradient(memory), fields))
+    memory, turning = stop_gradient((memory, fields))
+    if period:
+        middle = 0.5 * (jnp.max(turning[-period:]) + jnp.min(turning[-period:]))
+        turning = turning + BEYOND * (turning - middle) * (jnp.arange(len(turning)) / period)
+    rising, place, threshold = stop_gradient(_branches(frozen, memory, turning))
+    if period:
+        threshold = jnp.concatenate([_places(frozen, memory, 1)[:, 0], v])[place]
+        threshold = stop_gradient(threshold)
     moved = jax.linearize(lambda x, y: branch_magnetization(frozen, rising, x, 0.0, y), threshold, v)[1]
     rise, along = moved(jnp.ones_like(v), jnp.zeros_like(v)), moved(jnp.zeros_like(v), jnp.ones_like(v))
     base = branch_magnetization(table, rising, threshold, 0.0, v) - rise * threshold
@@ -172,6 +180,7 @@ def _again(law, c, drive, branch: _Known, corner):
 class Steps(eqx.Module):
     """A march to first order, step by step, of a rod in one or more shells. A state of d numbers goes from step to step; (field, M) of a
     shell after a step are a place from which later branches leave, numbered as in `_places`, `before` of them older than the first step.
+    `slopes`, `place`, `rising`, `threshold` and `ended` are of the steps that `ends_taken` tells.
 
     `slopes`: (steps, d + 2 shells + 3, d + 3 shells + 5 + parameters), of (state after, relay fields, M of the relays, field H, magnetization, its spread)
     by (state before, fields and M of the corners, what is added to M of the relays, applied field, current, and the three of a
@@ -198,12 +207,21 @@ class Steps(eqx.Module):
 
 
 DISTURBED = 3  # numbers of a disturbance
+BEYOND = 1e-7  # of the range of a period, by which each goes beyond the one before where there are many: more than steps are solved to
+AT_FIRST = 2  # periods that are taken to first order one by one: of a longer march the last stands for all after these
+
+
+def ends_taken(samples: int, period: int) -> np.ndarray:
+    """The samples at the ends of those steps of a march that `linearized` takes: of all, or of the first AT_FIRST periods and the last."""
+    ends, first = np.arange(1, samples), AT_FIRST * period
+    return ends if len(ends) <= first + period else np.concatenate([ends[:first], ends[-period:]])
 
 
 def linearized(made, parameters, applied, current, h, corners: int, scheme: str, period: int) -> Steps:
     """The steps of a march; `made(parameters)`: the actuator, `parameters`: (parameters,); the rest as in `magnetize`.
 
-    Its derivatives by the drive, the density, the parameters and what effects add are products of these few numbers.
+    Its derivatives by the drive, the density, the parameters and what effects add are products of these few numbers. Of a
+    long march they are those of the first periods and the last: what takes so long to repeat changes little from one to the next.
     """
     actuator = made(parameters)
     table = actuator.hysteresis.table()
@@ -223,7 +241,11 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     flat, marks, *rows = jax.lax.scan(advance, tied(march.carry, applied), (applied[1:], current[1:], ends))[1]
     first = (x * jnp.ones(shells) for x in (memory.field, memory.magnetization))
     v, m, H, M, spread = (jnp.concatenate([x[None], y]) for x, y in zip((*first, *(x.mean() for x in march.first[:3])), rows, strict=True))
-    known = jax.vmap(lambda v: _known(table, memory, v), 1, 1)(v)
+    begun, taken = jnp.stack([applied[0], current[0]]), ends_taken(len(applied), period)
+    long = len(taken) < len(applied) - 1
+    known = jax.vmap(lambda v: _known(table, memory, v, period if long else 0), 1, 1)(v)
+    flat, marks, ends, known = jax.tree.map(lambda x: x[taken - 1], (flat, marks, ends, known))
+    applied, current = applied[taken], current[taken]
     older = jnp.broadcast_to(_places(table, memory, 1)[:, :, None], (2 * memory.corners + 2, 2, shells))
     places = jnp.concatenate([older, jnp.stack([v[1:], m[1:]], axis=1)])
     corner = jnp.take_along_axis(places, known.place[:, None], axis=0)
@@ -238,8 +260,8 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
         then, (H, M, spread, *_) = after(_Trace(jnp.reshape(v, march.carry.memory.field.shape), None))
         return jnp.concatenate([_flat(then)[0], jnp.ravel(v), jnp.ravel(m), jnp.stack([H, M, spread])])
 
-    still = jnp.broadcast_to(jnp.concatenate([jnp.zeros(DISTURBED), parameters]), (len(v) - 1, DISTURBED + len(parameters)))
-    given = [flat, corner[:, 0], corner[:, 1], jnp.zeros_like(v[1:]), applied[1:, None], current[1:, None], still]
+    still = jnp.broadcast_to(jnp.concatenate([jnp.zeros(DISTURBED), parameters]), (len(taken), DISTURBED + len(parameters)))
+    given = [flat, corner[:, 0], corner[:, 1], jnp.zeros_like(known.field), applied[:, None], current[:, None], still]
     given = jnp.concatenate(given, axis=1), marks, ends, known
     slopes = jax.vmap(jax.jacfwd(one))(*given)
     last = jax.tree.map(lambda x: x[period - 1 :: period], given)
@@ -252,8 +274,8 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
         at = _Rest(applied * jnp.ones_like(march.carry.memory.field), jnp.reshape(m, march.carry.memory.field.shape))
         return _flat(_stepping(made(parameters), h, scheme, period)[0](applied, current, at))[0]
 
-    begin = jnp.concatenate([m[0], applied[:1], current[:1], parameters])
-    moved = jax.jacfwd(lambda x: _places(table, apply_field(table, start, x), 1))(applied[0])
+    begin = jnp.concatenate([m[0], begun, parameters])
+    moved = jax.jacfwd(lambda x: _places(table, apply_field(table, start, x), 1))(begun[0])
     ends_of_memory = jnp.stack([memory.maxima, memory.minima])
     return Steps(slopes, ended, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, spread, v)
 

@@ -14,6 +14,8 @@ from jaxtyping import Array, Bool, Float
 from ..errors import ConfigurationError
 from ..extrema import wiped
 
+TOUCHED = 1e-12  # of the fields in the memory: maxima as near as that are one
+
 
 class Memory(eqx.Module):
     """Corners of the memory curve with the magnetization at each, A/m; `overflow` tells that a corner was lost."""
@@ -42,9 +44,10 @@ class Memory(eqx.Module):
         return self.select(table, rising, jnp.where(rising, kept_up, kept_down))
 
     def select(self, table, rising, kept):
-        """As `branch`, with the number of surviving pairs known."""
-        last = jnp.maximum(kept - 1, 0)
-        here = jnp.minimum(kept, self.corners - 1)
+        """As `branch`, with the number of surviving pairs known; one less where a field falls from a maximum that came back to the one
+        before to TOUCHED: a loop that only rounding leaves open would stay a corner more in every period of a steady drive."""
+        kept = jnp.where(~rising & (kept > 0) & self._back(kept - 1), kept - 1, kept)
+        last, here = jnp.maximum(kept - 1, 0), self._latest(kept)
         bottom = kept == 0
         b = jnp.where(bottom, jnp.minimum(table.low, self.minima[0]), self.minima[last])
         m_b = jnp.where(bottom, table.lowest, self.m_minima[last])
@@ -52,16 +55,27 @@ class Memory(eqx.Module):
         m_there = jnp.where(rising, m_b, self.m_maxima[here])
         return rising, kept, threshold, m_there
 
+    def _back(self, k):
+        """Whether maximum k + 1 came back to maximum k."""
+        touched = TOUCHED * (jnp.abs(self.maxima[0]) + jnp.abs(self.minima[0]))
+        there, after = (self.maxima[jnp.clip(n, 0, self.corners - 1)] for n in (k, k + 1))
+        return after > there - touched
+
+    def _latest(self, k):
+        """The number of maximum k, or of the one that came back to it: of the two the field falls from the later one."""
+        return jnp.minimum(jnp.where(self._back(k), k + 1, k), self.corners - 1)
+
     def move(self, rising, kept, field, magnetization) -> "Memory":
         """The memory after the field has reached `field` on the branch given by `branch` or `select`."""
         index = jnp.arange(self.corners)
         replace = index >= kept
         turn = index == kept
-        keep_max = ~replace | (turn & ~rising)
+        latest = self._latest(kept)
+        top, m_top = (jnp.where(rising, new, old[latest]) for new, old in ((field, self.maxima), (magnetization, self.m_maxima)))
         return Memory(
-            maxima=jnp.where(keep_max, self.maxima, field),
+            maxima=jnp.where(turn, top, jnp.where(replace, field, self.maxima)),
             minima=jnp.where(replace, field, self.minima),
-            m_maxima=jnp.where(keep_max, self.m_maxima, magnetization),
+            m_maxima=jnp.where(turn, m_top, jnp.where(replace, magnetization, self.m_maxima)),
             m_minima=jnp.where(replace, magnetization, self.m_minima),
             field=field,
             magnetization=magnetization,
