@@ -129,8 +129,8 @@ class Rows:
     (parameters,), of those behind the march; `taken`: the samples of the march at the ends of its steps, as all that follow
     (`ends_taken`); `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom
     of the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`: (samples, 2), of applied field and
-    current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see
-    `magnetize`; `moving`: (parameters,), of those of the march; `mean`: (), of what is added to M of all samples.
+    current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see `magnetize`; `moving`:
+    (parameters,), of those of the march; `mean`: (), of what is added to M of all samples.
     """
 
     marched: Marched
@@ -276,10 +276,11 @@ class _Backward:
             asked.after[-self.samples - 1 : -1] = read
         return asked
 
-    def entering(self, given, asked, at=0.0) -> _Asked:
-        """`asked`, and what the next period asks of this one, as `_Passed.left`, and of places; the last period where these are not given, else the first ones."""
-        before = self.first - (0 if np.isscalar(at) else self.samples)
-        asked = _Asked(asked.after, asked.at + at, asked.state.copy(), asked.later.copy())
+    def entering(self, given, asked, at=None) -> _Asked:
+        """`asked` of the last period, and what the next one asks of it, as `_Passed.left`. `at`: what the last one asks of all places: then
+        of the first periods."""
+        before = self.first - (0 if at is None else self.samples)
+        asked = _Asked(asked.after, asked.at + (0.0 if at is None else at), asked.state.copy(), asked.later.copy())
         state, later, turned = np.split(given, np.cumsum([self.size, asked.later.shape[1]]), axis=1)
         asked.state[:] += state
         asked.later[:] += later
