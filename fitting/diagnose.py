@@ -43,7 +43,7 @@ from .own_signals import (
 )
 from .reach import BEYOND
 from .record_level import remove_from_checks
-from .rough import beside_cells, by_cells, is_rough, on_cells_alone, without_chance, worth_a_search
+from .rough import beside_cells, is_rough, on_better_density, on_cells_alone, without_chance, worth_a_search
 from .rows import DRIFTS, led_by_drifts
 from .screen import screened
 from .search import search
@@ -316,7 +316,7 @@ def _thorough(task, evidence, found) -> Diagnosis:
     if found.verdict == "unknown_at":
         found = without_worse(evidence, found)
         return with_learned_term(found, evidence.plain, evidence.recordings, evidence.bench, evidence.checks[1], task.progress)
-    if (rough or found.repaired is not None) and (finer := by_cells(task, evidence)):
+    if (rough or found.repaired is not None) and (finer := on_better_density(task, evidence)):
         again = verdict(finer)
         again = verdict(finer, rough=True) if rough and again.verdict != found.verdict else again
         found = again if again.verdict == found.verdict else found

@@ -169,7 +169,7 @@ def _highest_beside(result) -> float:
     return max((abs(c.z) for c in screened(result, result.choices)), default=0.0)
 
 
-def by_cells(task, evidence) -> Evidence | None:
+def on_better_density(task, evidence) -> Evidence | None:
     """The same with masses of cells, finer hats or the plain fit's steps in the final model, where they promise to foretell better;
     None elsewhere.
 

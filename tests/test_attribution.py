@@ -18,7 +18,7 @@ from fitting.diagnosis import Evidence
 from fitting.exchange import both_found
 from fitting.record_level import RecordEffect
 from fitting.report.banner import headline
-from fitting.report.diagnosis_page import _size
+from fitting.report.named import size_of
 from fitting.rows import behind, creeps_on, led_by_drifts, sizes_of, ties_of
 from fitting.screen import Candidate
 from fitting.search import Reached
@@ -1100,8 +1100,8 @@ def test_the_range_of_a_sensors_curve_stands_beside_its_size():
         "q": (0.02, 0.001, "1"), "centre": (3e-6, 0.0, "m"), "half": (2e-5, 0.0, "m")
     }  # fmt: skip
     at_bound = {"of_field": {"value": 1.0, "stderr": 0.0, "unit": "1"}}  # fitted
-    assert _size(at_bound) == "of_field = 1 ± 0"
-    assert _size(sizes) == "q = 0.02 ± 0.001; centre = 3e−6 m (given); half = 2e−5 m (given)"
+    assert size_of(at_bound) == "of_field = 1 ± 0"
+    assert size_of(sizes) == "q = 0.02 ± 0.001; centre = 3e−6 m (given); half = 2e−5 m (given)"
 
 
 def test_rivals_that_meet_the_noise_are_compared_with_the_details_of_their_laws(monkeypatch):

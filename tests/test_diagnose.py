@@ -318,7 +318,7 @@ def test_masses_of_cells_or_finer_hats_serve_a_final_model_where_they_promise_to
         Task, "fit", lambda task, actuator, choices, extra, **more: asked.append((choices.cells, extra)) or fits[choices.cells]
     )
     evidence = evidence_of([], now, now, (), {})
-    found = rough_module.by_cells(Task((), bench), evidence)
+    found = rough_module.on_better_density(Task((), bench), evidence)
     assert sorted(asked, key=str) == [(cells, ("sensor.offset",)) for cells in fits] and (found and found.excess) == taken
 
 
@@ -331,7 +331,7 @@ def test_the_steps_of_the_plain_density_serve_beside_effects_where_they_promise_
     now.unknowns, found.unknowns = 34.0, unknowns
     now.bench, now.problem = bench, SimpleNamespace(layout=SimpleNamespace(names=("coil.R_eddy",)))
     monkeypatch.setattr(Task, "fit", lambda task, actuator, choices, **more: asked.append(choices) or found)
-    rewarded = rough_module.by_cells(Task((), bench), evidence_of([], plain, now, (), {}))
+    rewarded = rough_module.on_better_density(Task((), bench), evidence_of([], plain, now, (), {}))
     assert asked == [dataclasses.replace(steps, rest="negative")]
     assert (rewarded is not None and rewarded.reached.current is found) == taken
 

@@ -5,21 +5,22 @@ import math
 import re
 
 from . import found as pictures
-from . import learned, loops, misfit, plane, tables
+from . import loops, misfit, plane, tables
 from .banner import headline, spoken, tone
-from .fit_page import AT_NOISE, DEFINED, FAR, bounds_of, convergence_part, headed, residual_section, sentence, validity
+from .catalogue import ranking
+from .fit_page import AT_NOISE, DEFINED, bounds_of, convergence_part, doubt_of, headed, residual_section, sentence, validity
+from .named import groups, named, next_experiment, unknown_section
 from .page import Sketch, part, section
+from .placebo import placebo_section
 from .residuals import repeating
-from .style import percent, plain, scale_of, terms_in, unit_text, words
+from .style import plain, scale_of, terms_in, unit_text, words
 
-RUN_PLACEBO = "To run it: magjax diagnose of these recordings with --placebo 20."
 HERE = re.compile(r"; run magjax diagnose on the same files| \(magjax diagnose tells which\)")  # a fit's advice, followed here
 FRAMED = (
     "The framed block need not be the darkest. The shades are of single effects of the catalogue, to first order; the frame stands where a "
     "smooth function that was fitted jointly with all else foretells recordings left out best, or, of those that foretell them about as well, "
     "where the rest of the model hides it least."
 )
-SEEN_AT = 5.0  # smallest_visible is seen at so many standard deviations
 
 
 def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
@@ -33,10 +34,10 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
     drive = str(evidence.get("drive", "current"))
     names = {c["name"] for c in found["candidates"]} | set(facts)
     sections = [
-        _named(found, facts),
-        _groups(found, facts),
-        _unknown(found, sketch),
-        section("Next experiment", *_next(found, names)),
+        named(found, facts),
+        groups(found, facts),
+        unknown_section(found, sketch),
+        section("Next experiment", *next_experiment(found, names)),
         section("The signal at fault", sketch(evidence.get("offender"), loops.offender, evidence.get("offender"))),
         section(
             "The recordings as they are",
@@ -45,7 +46,7 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         ),
         _checks(found, evidence, sketch, output, drive),
         _where(found, facts, base, repaired, sketch, output, drive),
-        _ranking(found, facts, sketch),
+        ranking(found, facts, sketch),
         _loops(found, base, repaired, sketch, output, drive),
         _left(found, base, repaired, sketch, output),
         _shifts(found),
@@ -72,113 +73,6 @@ def diagnosis_page(found, evidence, say=lambda text: None) -> dict:
         "headline": "No verdict can be trusted: the fit broke down" if broken and not known else headline(found),
         "message": said, "defined": DEFINED if fit else "", "sections": [s for s in sections if s],
     }  # fmt: skip
-
-
-def _doubt(fit) -> str:
-    """What is wrong with the standard errors of a fit, "" where nothing is or there is none."""
-    return validity(fit)[3] if fit else ""
-
-
-def _named(found, facts):
-    if not found["effects"]:
-        return None
-    doubt = _doubt(found["repaired"])
-    rows, laws = [], []
-    for e in found["effects"]:
-        rows.append([words(e["name"]), e["block"], _size(e["parameters"]), plain(e["confidence"], 2)])
-        about = facts.get(e["name"], {})
-        if about.get("law"):
-            laws.append(f"{words(e['name'])}: {about['law']}. How it shows: {about['signature']}. Source: {about['source']}.")
-    note = "Confidence: probability of the effect among those that were fitted, times the share of the excess misfit that it takes."
-    return section(
-        "What was left out",
-        part(
-            table=tables.table(
-                "Effects found", ["effect", "block", f"size (± {doubt})" if doubt else "size", "confidence"], rows, note
-            )
-        ),
-        part(bullets=laws),
-    )
-
-
-def _size(parameters) -> str:
-    """Parameters with their errors; what was given has none."""
-
-    def one(p):
-        if p.get("given"):
-            return " ".join(filter(None, (plain(p["value"], 4), unit_text(p["unit"]), "(given)")))
-        return f"{tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'])}".strip()
-
-    return "; ".join(f"{n} = {one(p)}" for n, p in parameters.items())
-
-
-def _groups(found, facts):
-    if not found["groups"]:
-        return None
-    rows, ties = [], found.get("ties", {})
-    for number, group in enumerate(found["groups"], 1):
-        for place, name in enumerate(group, 1):
-            about = facts.get(name, {})
-            size = _size(found.get("rivals", {}).get(name, {}))
-            row = [words(name), number, place, about.get("block", ""), size]
-            tie = ties.get(name, {"chi2_per_sample": None, "why": ""})
-            why = tie["why"] or ("the best" if name in ties else "")
-            row += [plain(tie["chi2_per_sample"]), said_of(why)] if ties else []
-            rows.append([*row, about.get("signature", "")])
-    left = (found["repaired"] or {}).get("chi2_per_sample") or 0.0
-    whole = found["verdict"] != "unknown_at" and left < FAR  # else something is left that none of them explains
-    does = "Each of these repairs the model" if whole else "Each of these takes the same part of the misfit"
-    text = f"{does}, and to name one from these recordings would be a guess."
-    text += " Why each is not told from the best stands beside it; χ²/N is that of a fit with it." if ties else ""
-    head = [
-        "rival",
-        "group",
-        "rank in its group",
-        "block",
-        "size, were it this",
-        *(("χ²/N", "why it is in the group") if ties else ()),
-        "how it shows",
-    ]
-    return section(
-        "Not told apart by these recordings", part(text=text, table=tables.table("Rivals, most likely first", head, rows))
-    )
-
-
-def said_of(text: str) -> str:
-    """A phrase of the search in the signs of the page."""
-    return text.replace("chi2", "χ²")
-
-
-def _unknown(found, sketch):
-    unknown = found["unknown"]
-    if not unknown:
-        return None
-    rows = [["block it acts most like", unknown.get("block", "")], ["region", unknown.get("region", "")]]
-    if "explained_share" in unknown:
-        rows.append(["share of the excess that the nearest effect explains", percent(unknown["explained_share"])])
-    more = {} if "function" in unknown else unknown
-    rows += [
-        [words(k), _shown(v)]
-        for k, v in more.items()
-        if k not in ("block", "region", "explained_share") and isinstance(v, (str, int, float))
-    ]
-    known = part(table=tables.table("The unknown", ["question", "answer"], rows))
-    return section("What is known of it", known, *learned.parts(unknown, sketch))
-
-
-def _next(found, names):
-    ask = found["next_experiment"]
-    if not ask:
-        return []
-    parts = [part(text=sentence(spoken(ask["text"], names)))]
-    channels = [c for c in ask.get("channels", []) if c]
-    told = all(c in ask["text"] for c in channels)
-    parts.append(None if told else part(text=f"Channels to record: {'; '.join(channels)}."))
-    rows = [[words(a), words(b), plain(p, 2)] for a, b, p in ask.get("separates", [])]
-    parts.append(
-        part(table=tables.table("What it separates", ["effect", "from", "probability of the right name"], rows)) if rows else None
-    )
-    return parts
 
 
 def _checks(found, evidence, sketch, output, drive):
@@ -228,75 +122,6 @@ def _where(found, facts, base, repaired, sketch, output, drive):
         *headed(
             f"By branch, {terms_in(base).field} and period", sketch(where.get("by_branch"), pictures.places, where, base, output)
         ),
-    )
-
-
-def power(candidate, facts) -> str:
-    """Probability that these recordings would show the effect at the top of its typical range."""
-    typical = facts.get(candidate["name"], {}).get("typical")
-    visible = candidate["smallest_visible"]
-    if not typical or not visible or tried_at(candidate) is not None or not math.isfinite(visible):
-        return "–"
-    z = SEEN_AT * typical / visible
-    return percent(0.5 * (1 + math.erf((z - pictures.THRESHOLD) / math.sqrt(2))))
-
-
-def tried_at(candidate) -> float | None:
-    """The finite amplitude at which a candidate was scored, None where its score is to first order."""
-    same = candidate["amplitude"] == candidate["smallest_visible"]  # so it was stored before it was told
-    return candidate.get("tried_at", candidate["amplitude"] if same else None)
-
-
-def _ranking(found, facts, sketch):
-    ranked = sorted(
-        (c for c in found["candidates"] if math.isfinite(c["z"] if c["z"] is not None else math.nan)), key=lambda c: -abs(c["z"])
-    )
-    if not ranked:
-        return None
-    rows = []
-    for c in ranked:
-        unit = f" {unit_text(facts.get(c['name'], {}).get('unit', ''))}".rstrip()
-        drop = c["achieved_chi2_drop"]
-        fell = "not fitted" if drop is None else plain(drop) if drop >= 0 else f"rose by {plain(-drop)}"
-        strong = "–" if c["name"] in found["absorbed"] else power(c, facts)
-        bic = plain(c["bic_change"]) if c["bic_change"] is not None else ""
-        finite = tried_at(c)
-        size = f"{plain(c['amplitude'])}{unit}" if finite is None else f"tried at {plain(finite)}{unit}"
-        seen = f"{plain(c['smallest_visible'])}{unit}" if finite is None else "–"
-        rows.append([words(c["name"]), facts.get(c["name"], {}).get("block", ""), plain(c["z"]), plain(c["visibility"], 2), size, seen, strong,
-                     plain(c["predicted_chi2_drop"]), fell, bic])  # fmt: skip
-    head = [
-        "effect",
-        "block",
-        "z",
-        "visibility",
-        "amplitude, first order",
-        "visible from",
-        "power",
-        "χ² fall, predicted",
-        "achieved",
-        "change of BIC",
-    ]
-    note = (
-        "z: score in standard deviations. Visibility: what share of its mark the base model cannot imitate. Visible from: amplitude seen at five "
-        "standard deviations. Power: probability that these recordings would show the effect at the top of its typical range. Achieved: what "
-        "a fit with the effect took, that of an adopted one as it ended, on a density that may be finer by then than its rivals'; where χ² rose, "
-        "the fit did not settle."
-    )
-    if any(tried_at(c) is not None for c in ranked):
-        note += (
-            " Tried at: scored at this amplitude, for it has no mark to first order; from where it would be visible is not known."
-        )
-    if any(c["z"] == 0 and c["amplitude"] < 0 for c in ranked):
-        note += " A z of 0 beside an amplitude below 0: the misfit asks for the sign that the effect cannot have."
-    absorbed = ", ".join(words(n) for n in found["absorbed"])
-    text = f"These recordings could not show {absorbed}: the density imitates them." if absorbed else ""
-    drawn = sketch(ranked, pictures.ranking, ranked)
-    return section(
-        "The catalogue against the misfit",
-        drawn,
-        part(table=tables.table("Every candidate, best first", head, rows, note)),
-        part(text=text),
     )
 
 
@@ -351,53 +176,6 @@ def _shifts(found):
     )
 
 
-def placebo_section(placebo, verdict):
-    """How often the search cries wolf on recordings that lack nothing; or that this was not tried, and how to."""
-    title = "Placebo"
-    if not placebo:
-        if verdict == "data_problem":
-            return None
-        text = (
-            "Not tried. The final model is simulated on the same drives with fresh noise, those recordings are searched as the measured ones "
-            "were, and it is counted how often the search adopts an effect though nothing more is there."
-        )
-        return section(title, part(text=text), part(text=RUN_PLACEBO))
-    number, false, table = placebo["runs"], placebo["false_alarms"], "The same search on recordings that lack nothing"
-    low, high = interval(false, number)
-    share = f"({percent(false / number)}; 95 % interval {percent(low)} to {percent(high)})"
-    if placebo.get("procedure") == "search":
-        scored = placebo["screening_alarms"]
-        text = (
-            f"In {false} of {number} sets of recordings simulated from the final model the same search adopted an effect, where nothing more "
-            f"was {share}. In {scored} of them something scored above the threshold of the screening and was fitted beside its rivals; in the "
-            "others the search ended there by its own rule."
-        )
-    else:  # a folder written when the screening alone was repeated
-        table = "The screening of recordings that lack nothing"
-        text = (
-            f"In {false} of {number} sets of recordings simulated from the final model something scored above the threshold, where nothing more "
-            f"was {share}. Only the screening was repeated: an alarm names nothing yet."
-        )
-    rows = [[words(str(k)), _shown(v)] for k, v in placebo.items()]
-    return section(title, part(text=text), part(table=tables.table(table, ["quantity", "value"], rows)))
-
-
-def _shown(value) -> str:
-    if isinstance(value, dict):
-        return "; ".join(f"{words(str(k))}: {_shown(v)}" for k, v in value.items()) or "none"
-    if isinstance(value, (list, tuple)):
-        return ", ".join(_shown(v) for v in value) or "none"
-    return plain(value, 4) if isinstance(value, float) else str(value)
-
-
-def interval(hits: int, number: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
-    z, p = 1.96, hits / number
-    centre, half = p + z * z / (2 * number), z * math.sqrt(p * (1 - p) / number + z * z / (4 * number**2))
-    scale = 1 + z * z / number
-    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
-
-
 def _models(found, evidence, sketch, drive):
     base, repaired = found["base"], found["repaired"]
     best = evidence.get("repaired") or evidence.get("base") or {}
@@ -411,7 +189,7 @@ def _models(found, evidence, sketch, drive):
             ),
             part(table=tables.correlations(repaired)),
             part(text=plane.told(best, repaired)),
-            sketch(best, plane.mass_map, best, doubt=_doubt(repaired)),
+            sketch(best, plane.mass_map, best, doubt=doubt_of(repaired)),
             sketch(best.get("inside"), loops.inside, best, drive),
             convergence_part(sketch, repaired),
         )

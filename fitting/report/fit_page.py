@@ -160,3 +160,8 @@ def _quantities(fit, evidence):
     drive = str(evidence.get("drive", "current"))
     channel = fit["recordings"][0]["channel"] if fit["recordings"] else "displacement"
     return channel if channel in tables.CHANNEL_OF.values() else tables.CHANNEL_OF.get(unit, "displacement"), drive
+
+
+def doubt_of(fit) -> str:
+    """What is wrong with the standard errors of a fit, "" where nothing is or there is none."""
+    return validity(fit)[3] if fit else ""

@@ -183,3 +183,12 @@ def short_path(path: str) -> str:
 
 def _escape(text: str) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&quot;")
+
+
+def shown(value) -> str:
+    """Any value of a result in words: numbers, and what holds them."""
+    if isinstance(value, dict):
+        return "; ".join(f"{words(str(k))}: {shown(v)}" for k, v in value.items()) or "none"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(shown(v) for v in value) or "none"
+    return plain(value, 4) if isinstance(value, float) else str(value)

@@ -16,11 +16,13 @@ import pytest
 from fitting.locate import where
 from fitting.report import rebuild, store, write_diagnosis, write_fit
 from fitting.report.banner import headline, tone
-from fitting.report.diagnosis_page import _shifts, _size, diagnosis_page, interval, placebo_section
+from fitting.report.diagnosis_page import _shifts, diagnosis_page
 from fitting.report.fit_page import diagnose_command, sentence, validity
 from fitting.report.learned import learned_function
 from fitting.report.loops import inside, loops
+from fitting.report.named import size_of
 from fitting.report.page import kept_together
+from fitting.report.placebo import interval, placebo_section
 from fitting.report.plane import never_switched, told
 from fitting.report.residuals import repeating, strokes
 from fitting.report.tables import interval as interval_of
@@ -418,7 +420,7 @@ def test_a_diagnosis_shows_its_grounds(folders, diagnoses):
     assert "Next experiment" in group and "the coil current by a shunt" in group and "most likely first" in group
     apart = " from ".join(n.replace("_", " ") for n in diagnoses["group"].groups[0])
     assert f"separates {apart}" in group  # no underscores in what people read
-    (size,) = map(_size, diagnoses["group"].rivals.values())
+    (size,) = map(size_of, diagnoses["group"].rivals.values())
     assert size.startswith("tau = ") and kept_together(size) in group  # what a rival would be
 
 
