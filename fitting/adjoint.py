@@ -7,8 +7,6 @@ would add; neither asks for a program of its own.
 """
 
 import dataclasses
-import itertools
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.chain import Timeline
-from magjax.chain.march import AT_FIRST, DISTURBED, Steps, ends_taken, linearized
+from magjax.chain.march import Steps, linearized
 from magjax.effects.base import AbstractEffect
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain
 
+from .periods import Backward
 from .starts import unreached_row
 
 
@@ -193,11 +192,11 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     Where the last period stands for others, what it leaves for the one before is led through it again: by the few numbers that go
     from period to period, X -> A X, of which the sum over all of them is led through the steps at once.
     """
-    back = _Backward(marched, signals.shape[3])
+    back = Backward(marched, signals.shape[3])
     asked = back.asked(signals)
     passed = back.led(asked)
     if not back.before:
-        return back.rows([passed], signals, read)
+        return _gathered(back, [passed], signals, read)
     A, left = back.led(back.each()).left, passed.left
     every = left
     for _ in range(back.before - 1):
@@ -205,146 +204,34 @@ def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
         every = every + left
     last = back.led(back.entering(every, asked))
     first = back.led(back.entering(A @ left, back.nothing(signals.shape[1]), last.at), first=True)
-    return back.rows([first, last], signals, read)
+    return _gathered(back, [first, last], signals, read)
 
 
-class _Asked(NamedTuple):
-    """What is asked of some steps, for some lines: of (field H, M, its spread) after each, (steps, recordings, 3, lines), of
-    (field, M) of every place, (places, recordings, 2, shells, lines), of the state after the last step and of the states of effects at the
-    period before, (recordings, numbers, lines) each."""
-
-    after: np.ndarray
-    at: np.ndarray
-    state: np.ndarray
-    later: np.ndarray
-
-
-class _Passed(NamedTuple):
-    """What the lines ask of the steps, one by one: `through`, (steps, recordings, numbers, lines), and of parameters, (recordings,
-    parameters, lines); of all places, `at`, as in `_Asked`; and `left`, (recordings, numbers, lines), for the period before."""
-
-    through: np.ndarray
-    parameters: np.ndarray
-    at: np.ndarray
-    left: np.ndarray
-
-
-class _Backward:
-    """The steps of marches, to be gone through from the last to the first.
-
-    Where they are those of the first periods and the last, the last stands for `before` more between them. A state, what effects keep for
-    a period and the places from which branches leave a period later, `turned`, go from one period to the next. Places: older ones, those
-    of the steps, and those of the period before the last.
-    """
-
-    def __init__(self, marched, samples):
-        steps = marched.steps
-        self.marched, self.samples = marched, samples
-        self.number, self.count, self.shells = steps.place.shape
-        self.size, self.older, marks = steps.rest.shape[1], steps.moved.shape[1], steps.ended.shape[3]
-        self.slopes = steps.slopes.swapaxes(2, 3)  # (recordings, steps, in, out)
-        self.marks = slice(self.size - marks, self.size)  # states of effects, of which the end of a later period asks
-        total = steps.relay_field.shape[1] - 1
-        self.taken = ends_taken(total + 1, samples)
-        self.before, self.place, self.turned = (total - self.count) // samples, steps.place, np.zeros((self.number, 0), int)
-        self.first = AT_FIRST * samples if self.before else 0  # steps that are gone through by themselves
-        if self.before:
-            step, between = steps.place - self.older, np.zeros((self.number, samples), bool)  # step: of the whole march, at the corner
-            earlier = (step >= self.first) & (step < total - samples)
-            own = np.where(earlier, self.count + step % samples, step - np.where(step >= self.first, total - self.count, 0))
-            self.place = self.older + own
-            for k, there in enumerate(earlier):
-                between[k, step[k][there] % samples] = True
-            self.turned = np.argsort(~between, axis=1, kind="stable")[:, : between.sum(axis=1).max()]
-
-    def nothing(self, lines) -> _Asked:
-        """Room for what is asked."""
-        places, marks = self.older + self.count + (self.samples if self.before else 0), self.marks.stop - self.marks.start
-        shapes = (self.count, self.number, 3), (places, self.number, 2, self.shells), (self.number, self.size), (self.number, marks)
-        return _Asked(*(np.zeros((*shape, lines)) for shape in shapes))
-
-    def asked(self, signals) -> _Asked:
-        """What the lines ask of the last period."""
-        steps, asked, every = self.marched.steps, self.nothing(signals.shape[1]), np.arange(self.number)
-        relay, mean = steps.relay_field[:, -self.samples :].mean(axis=2), signals[:, :, 1].sum(axis=-1)
-        for end, slope in zip((relay.argmax(axis=1), relay.argmin(axis=1)), self.marched.unreached.T, strict=True):
-            asked.at[self.older + self.count - self.samples + end, every, 0] += (slope[:, None] * mean)[:, None] / self.shells
-        read = np.moveaxis(signals[:, :, :3], (3, 2), (0, 2))
-        if self.before:
-            asked.after[-self.samples :] = np.roll(read, -1, axis=0)  # the end of a period is its first sample
-        else:
-            asked.after[-self.samples - 1 : -1] = read
-        return asked
-
-    def entering(self, given, asked, at=None) -> _Asked:
-        """`asked` of the last period, and what the next one asks of it, as `_Passed.left`. `at`: what the last one asks of all places: then
-        of the first periods."""
-        before = self.first - (0 if at is None else self.samples)
-        asked = _Asked(asked.after, asked.at + (0.0 if at is None else at), asked.state.copy(), asked.later.copy())
-        state, later, turned = np.split(given, np.cumsum([self.size, asked.later.shape[1]]), axis=1)
-        asked.state[:] += state
-        asked.later[:] += later
-        turned = turned.reshape(self.number, self.turned.shape[1], 2, self.shells, given.shape[2])
-        for k, there in enumerate(self.turned):
-            asked.at[self.older + before + there, k] += turned[k]
-        return asked
-
-    def each(self) -> _Asked:
-        """Every number that goes from period to period, as lines."""
-        every = self.size + self.marks.stop - self.marks.start + 2 * self.shells * self.turned.shape[1]
-        return self.entering(np.broadcast_to(np.eye(every), (self.number, every, every)), self.nothing(every))
-
-    def led(self, asked: _Asked, first: bool = False) -> _Passed:
-        """From the last step to the first: through all, or the last period where it stands for others, or the `first` ones then."""
-        number, shells, size, slopes = self.number, self.shells, self.size, self.slopes
-        cuts = np.cumsum([0, size, 2 * shells, shells + 2 + DISTURBED, slopes.shape[2] - size - 3 * shells - 2 - DISTURBED])
-        state, corners, added, moving = (slice(*ends) for ends in itertools.pairwise(cuts))
-        lines, every, at, later = asked.after.shape[3], np.arange(number), asked.at.copy(), asked.later
-        begin, end = (0, self.first) if first else (self.first, self.count)
-        through, parameters = np.empty((end - begin, number, added.stop - added.start, lines)), 0.0
-        out, back = np.zeros((number, slopes.shape[3], lines)), np.empty((number, slopes.shape[2], lines))
-        out[:, :size] = asked.state
-        for t in range(end - 1, begin - 1, -1):
-            out[:, size:-3] = at[self.older + t].reshape(number, 2 * shells, lines)
-            out[:, -3:] = asked.after[t]
-            if (t + 1) % self.samples == 0:
-                out[:, self.marks] += later
-                later = self.marched.steps.ended[:, t // self.samples].swapaxes(1, 2) @ out[:, :size]
-            np.matmul(slopes[:, t], out, out=back)
-            out[:, :size], through[t - begin] = back[:, state], back[:, added]
-            left = back[:, corners].reshape(number, 2, shells, lines)
-            for s in range(shells):
-                at[self.place[:, t, s], every, :, s] += left[:, :, s]
-            parameters = parameters + back[:, moving]
-        turned = at[self.older + self.count + self.turned.T, every].swapaxes(0, 1)
-        turned = turned.reshape(number, 2 * shells * self.turned.shape[1], lines)
-        return _Passed(through, parameters, at, np.concatenate([out[:, :size], later, turned], axis=1))
-
-    def rows(self, passed, signals, read) -> Rows:
-        """What was led through the periods, the first one first, as `Rows`."""
-        steps, number, shells, size, older = self.marched.steps, self.number, self.shells, self.size, self.older
-        at, end = passed[0].at[:older].copy(), passed[0].left
-        out = end[:, :size].copy()
-        out[:, self.marks] += end[:, size : size + self.marks.stop - self.marks.start]
-        first = steps.rest.swapaxes(1, 2) @ out
-        at[older - 1, :, 1] += first[:, :shells]
-        known = at.sum(axis=3)  # shells have the same before the first step
-        begin = first[:, shells : shells + 2]
-        begin[:, 0] += np.einsum("prkl,rpk->rl", known, steps.moved)
-        known = np.moveaxis(known[:, :, 1], 0, 2)
-        number_of = (older - 2) // 2
-        known[..., 2 * number_of] += known[..., older - 1]  # the last minimum is where the memory stands
-        for k in range(number_of - 1, -1, -1):  # a minimum is reached from its maximum, that from the minimum before it
-            known[..., 1 + k] += known[..., 1 + number_of + k]
-            known[..., number_of + k if k else 0] += known[..., 1 + k]
-        through = np.concatenate([p.through for p in passed]) if len(passed) > 1 else passed[0].through
-        through = through.transpose(1, 3, 0, 2)  # (recordings, lines, steps, ...)
-        drive = through[:, :, :-1, shells : shells + 2]
-        drive = np.concatenate([begin.swapaxes(1, 2)[:, :, None], drive], axis=2)
-        drive = drive.reshape(number, signals.shape[1], -1, self.samples, 2).sum(axis=2)
-        drive[:, :, 0] += through[:, :, -1, shells : shells + 2]
-        own, disturbed = through[..., :shells], through[..., shells + 2 :]
-        moving = (sum(p.parameters for p in passed) + first[:, shells + 2 :]).swapaxes(1, 2)
-        mean = signals[:, :, 1].sum(axis=-1)
-        marched = dataclasses.replace(self.marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
-        return Rows(marched, signals, read, self.taken, own, known[..., : older - 1], drive, disturbed, moving, mean)
+def _gathered(back: Backward, passed, signals, read) -> Rows:
+    """What was led through the periods, the first one first, as `Rows`."""
+    steps, number, shells, size, older = back.marched.steps, back.number, back.shells, back.size, back.older
+    at, end = passed[0].at[:older].copy(), passed[0].left
+    out = end[:, :size].copy()
+    out[:, back.marks] += end[:, size : size + back.marks.stop - back.marks.start]
+    first = steps.rest.swapaxes(1, 2) @ out
+    at[older - 1, :, 1] += first[:, :shells]
+    known = at.sum(axis=3)  # shells have the same before the first step
+    begin = first[:, shells : shells + 2]
+    begin[:, 0] += np.einsum("prkl,rpk->rl", known, steps.moved)
+    known = np.moveaxis(known[:, :, 1], 0, 2)
+    number_of = (older - 2) // 2
+    known[..., 2 * number_of] += known[..., older - 1]  # the last minimum is where the memory stands
+    for k in range(number_of - 1, -1, -1):  # a minimum is reached from its maximum, that from the minimum before it
+        known[..., 1 + k] += known[..., 1 + number_of + k]
+        known[..., number_of + k if k else 0] += known[..., 1 + k]
+    through = np.concatenate([p.through for p in passed]) if len(passed) > 1 else passed[0].through
+    through = through.transpose(1, 3, 0, 2)  # (recordings, lines, steps, ...)
+    drive = through[:, :, :-1, shells : shells + 2]
+    drive = np.concatenate([begin.swapaxes(1, 2)[:, :, None], drive], axis=2)
+    drive = drive.reshape(number, signals.shape[1], -1, back.samples, 2).sum(axis=2)
+    drive[:, :, 0] += through[:, :, -1, shells : shells + 2]
+    own, disturbed = through[..., :shells], through[..., shells + 2 :]
+    moving = (sum(p.parameters for p in passed) + first[:, shells + 2 :]).swapaxes(1, 2)
+    mean = signals[:, :, 1].sum(axis=-1)
+    marched = dataclasses.replace(back.marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
+    return Rows(marched, signals, read, back.taken, own, known[..., : older - 1], drive, disturbed, moving, mean)
