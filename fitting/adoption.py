@@ -6,6 +6,7 @@ import numpy as np
 
 from .attribute import (
     BIC_DROP,
+    FORM_ERROR,
     LIKE_DENSITY,
     MIN_DROP,
     MISFIT,
@@ -27,7 +28,6 @@ from .verdict import FAR_FROM_NOISE, HALF
 
 LITTLE_LEFT = 0.2  # share of a chi2/N that an effect may leave for a finer density to be tried beside it, however far that is
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
-FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
 LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
 
 

@@ -24,7 +24,8 @@ CLOSE = 0.8  # share of the best score that makes a close rival
 MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
 BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
-WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much
+WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much, or to
+FORM_ERROR = 0.005  # of what the effects found before them take: as little as that is left by the form of their laws
 UNCONFIRMED_TIE = (0.3, 50.0)  # the same where check recordings are missed as far with the best as without
 SAME_DIRECTION = 0.97
 OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law imitates another
@@ -219,23 +220,31 @@ def _physical(effect) -> bool:
     return (info.low < 0 or amplitude >= 0) and abs(amplitude) <= largest and effect.is_itself()
 
 
-def rivals_of(best: Trial, trials, near=WEAK_TIE) -> list[Trial]:
-    """Trials that the data do not tell from the best, the best first; `near`: as `WEAK_TIE`.
+def rivals_of(best: Trial, trials, near=WEAK_TIE, others: float = 0.0) -> list[Trial]:
+    """Trials that the data do not tell from the best, the best first; `near`: as `WEAK_TIE`; `others`: the fall of chi2 by the other effects.
 
     By BIC or by AIC, whichever sees them nearer: shapes are held by priors and cost less than BIC charges.
     """
-    tied = [t for t in trials if t is not best and t.physical and tie_of(best, t, near)]
+    tied = [t for t in trials if t is not best and t.physical and tie_of(best, t, near, others)]
     return sorted([best, *tied], key=lambda t: t.bic_change)
 
 
-def tie_of(best: Trial, t: Trial, near=WEAK_TIE) -> str:
-    """Why the data do not tell a trial from the best, in words; "" where they do."""
+def taken_beside(steps, index=None) -> float:
+    """The fall of chi2 by all effects that were adopted, but the one at an index; `steps`: as of `search.Reached`."""
+    fits = [*(previous for *_, previous in steps), *(best.result for best, *_ in steps[-1:])]
+    return sum(chi2_of(fits[k]) - chi2_of(fits[k + 1]) for k in range(len(steps)) if k != index)
+
+
+def tie_of(best: Trial, t: Trial, near=WEAK_TIE, others: float = 0.0) -> str:
+    """Why the data do not tell a trial from the best, in words; "" where they do; `near`, `others`: as of `rivals_of`."""
     behind = min(t.bic_change - best.bic_change, best.drop - t.drop + 2 * (t.parameters - best.parameters))
     if behind < TIE:
         return f"its BIC or AIC comes within {TIE:g} of the best's"
-    if t.result.chi2_per_sample < SETTLED_CHI2 and behind < min(near[0] * best.drop, near[1]):
-        foretold = "" if near == WEAK_TIE else ", and with the best the check recordings are still missed about as far as without"
-        return f"it meets the noise too (chi2/N below {SETTLED_CHI2:g}), {behind:.0f} in chi2 behind the best{foretold}"
+    if t.result.chi2_per_sample < SETTLED_CHI2 and behind < min(near[0] * best.drop, max(near[1], FORM_ERROR * others)):
+        met = f"it meets the noise too (chi2/N below {SETTLED_CHI2:g}), {behind:.0f} in chi2 behind the best"
+        if behind < near[1]:
+            return met + (", and with the best the check recordings are still missed about as far as without" if near != WEAK_TIE else "")
+        return f"{met}: less than {FORM_ERROR:.1%} of what the other effects take, whose laws may differ by as much in form"
     left = best.result.chi2_per_sample
     share = MISFIT_TIE * min(max(left - SETTLED_CHI2, 0.0) / (MISFIT - SETTLED_CHI2), 1.0)
     if share and left_by_density(best.result):

@@ -22,6 +22,7 @@ from .attribute import (
     excess_of,
     leaders,
     rivals_of,
+    taken_beside,
     to_the_end,
 )
 from .check import check_errors
@@ -120,7 +121,7 @@ def _exchanged(task, state, index, check=()) -> bool:
         trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
     trials = [t for t in trials + fresh if t.physical]
     found = min(trials, key=lambda t: t.bic_change)
-    state.steps[index] = (found, rivals_of(found, trials), trials, previous)
+    state.steps[index] = (found, rivals_of(found, trials, others=taken_beside(state.steps, index)), trials, previous)
     state.current = found.result
     return found.name != best.name
 

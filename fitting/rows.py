@@ -6,7 +6,7 @@ import numpy as np
 
 from magjax.effects import CLASSES
 
-from .attribute import SETTLED_CHI2, UNCONFIRMED_TIE, chi2_of, confidence, rivals_of, tie_of
+from .attribute import SETTLED_CHI2, UNCONFIRMED_TIE, chi2_of, confidence, rivals_of, taken_beside, tie_of
 
 CREEPS_AFTER = 0.8  # of the drifts, weighed by their recordings' mean readings, that go the way of a creep
 DRIFTS = ("zero_drift", "thermal_drift")
@@ -70,10 +70,12 @@ def ties_of(evidence) -> dict:
     for effect, rivals in evidence.adopted:
         why = "between the harmonics its score comes near the best's"
         ties |= {r.name: {"chi2_per_sample": None, "why": why if r is not effect else ""} for r in (effect, *rivals) if rivals}
-    for best, rivals, *_ in evidence.reached.steps:
+    steps = evidence.reached.steps
+    for k, (best, rivals, *_) in enumerate(steps):
+        others = taken_beside(steps, k)
         for t in rivals if len(rivals) > 1 else ():
             result = evidence.reached.current if t is best else t.result
-            why = "" if t is best else tie_of(best, t) or tie_of(best, t, UNCONFIRMED_TIE)
+            why = "" if t is best else tie_of(best, t, others=others) or tie_of(best, t, UNCONFIRMED_TIE)
             ties[t.name] = {"chi2_per_sample": result.chi2_per_sample, "why": why}
     return ties
 

@@ -8,16 +8,18 @@ import dataclasses
 
 import numpy as np
 
-from .adoption import FAR_BESIDE, FORM_ERROR, of_two, promises, refitted
+from .adoption import FAR_BESIDE, of_two, promises, refitted
 from .attribute import (
     BIC_DROP,
     FEEDBACKS,
+    FORM_ERROR,
     MIN_DROP,
     MISFIT,
     chi2_of,
     excess_of,
     leaders,
     rivals_of,
+    taken_beside,
 )
 from .check import check_errors
 from .diagnosis import SILENT_CHI2
@@ -69,7 +71,7 @@ class Reached:
 
     def adopt(self, best, good):
         """Go on from a trial, beside the others that earned their place."""
-        self.steps.append((best, rivals_of(best, good), good, self.current))
+        self.steps.append((best, rivals_of(best, good, others=taken_beside(self.steps)), good, self.current))
         self.current, self.under_way = best.result, {}
 
 

@@ -86,6 +86,21 @@ def test_rivals_are_those_that_the_data_do_not_tell_apart():
     assert "within 9" in tie_of(best, by_parameters) and tie_of(best, behind) == ""
 
 
+def test_beside_a_strong_effect_a_rival_may_be_behind_by_what_its_law_may_differ_in_form():
+    """Beside a field that diffuses, which took 13,000, an after-effect was named for a damping that met the noise 46 behind it."""
+    first = trial("field_diffusion", 6.0, base=6.0 + 13_000 / COUNT)
+    best, near = trial("magnetic_aftereffect", 0.96, base=6.0), trial("structural_damping", 0.96 + 46 / COUNT, base=6.0, direction=(0, 1, 0))
+    far = trial("creep", 0.96 + 70 / COUNT, base=6.0, direction=(0, 0, 1))
+    plain = SimpleNamespace(chi2_per_sample=6.0 + 13_000 / COUNT, data_count=COUNT)
+    reached = Reached(plain, [], {})
+    reached.adopt(first, [first])
+    assert names(rivals_of(best, [best, near, far])) == ["magnetic_aftereffect"]
+    reached.adopt(best, [best, near, far])
+    assert names(reached.steps[1][1]) == ["magnetic_aftereffect", "structural_damping"]
+    assert "0.5% of what the other effects take" in ties_of(SimpleNamespace(adopted=(), reached=reached))["structural_damping"]["why"]
+    assert names(reached.steps[0][1]) == ["field_diffusion"]
+
+
 def test_a_name_that_no_check_recording_confirms_has_more_rivals():
     """As a weak after-effect of another form did, behind structural_damping by 21 in BIC of 185."""
     best, near, far = (
@@ -202,7 +217,7 @@ def test_the_search_leaves_out_rivals_that_it_has_found(monkeypatch):
         return task, None, True
 
     monkeypatch.setattr(fitting.search, "_forward", forward)
-    found = fitting.search.search(Task((), None), SimpleNamespace(choices=Choices(), chi2_per_sample=121.0), [])
+    found = fitting.search.search(Task((), None), SimpleNamespace(choices=Choices(), chi2_per_sample=121.0, data_count=COUNT), [])
     assert [names(rivals) for _, rivals, *_ in found.steps] == [["amplifier_clipping"], ["coulomb_friction"]]
 
 
@@ -942,7 +957,7 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
         actuator: object = dataclasses.field(default_factory=lambda: held)
 
     current = Result(1.6)
-    steps = [(best, [best], [best, rival, far], None), (trial("sensor_lag", 1.6, base=20.0), [], [], None)]
+    steps = [(best, [best], [best, rival, far], Result(150.0)), (trial("sensor_lag", 1.6, base=20.0), [], [], Result(20.0))]
     tried = []
 
     def fitted(task, rest, c, excess, target):
