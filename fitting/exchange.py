@@ -60,19 +60,20 @@ def backward(task, state, made_up=None):
         if rise < max(MIN_DROP, HALF * excess_of(trial, NULL_CHI2)):
             state.current = trial
             if state.form:
-                state.steps[state.steps.index(step)] = _in_its_place(step, made_up, trial)
+                index = state.steps.index(step)
+                state.steps[index] = _in_its_place(step, made_up, trial, taken_beside(state.steps, index))
                 state.form = None
             else:
                 state.steps.remove(step)
 
 
-def _in_its_place(step, candidate, result):
-    """The step of an effect that was dropped, with what made up for its form: then the form was not its own."""
+def _in_its_place(step, candidate, result, others):
+    """The step of an effect that was dropped, with what made up for its form: then the form was not its own. `others`: as of `rivals_of`."""
     _, _, good, previous = step
     effect = result.actuator.effect(candidate.name)
     found = credited(candidate, result, previous, effect, max(excess_of(previous), MIN_DROP))
     trials = [found, *(t for t in good if t.name != candidate.name)]
-    return found, rivals_of(found, trials), trials, previous
+    return found, rivals_of(found, trials, others=others), trials, previous
 
 
 def _nothing(result, name) -> bool:
