@@ -61,7 +61,7 @@ def marched_steps(template, names, point, predictor) -> Marched:
         parameters = jnp.append(point.parameters, 1.0)
         actuator, (applied, current) = made(parameters), driven(parameters)
         whole = (jnp.append(jnp.tile(x, *predictor.periods), x[:1]) for x in (applied, current))
-        steps = linearized(made, parameters, *whole, dt, predictor.corners, actuator.coil.scheme, count)
+        steps = linearized(made, parameters, *whole, dt, predictor.corners, actuator.coil.scheme, count, predictor.times)
         relay = steps.relay_field[-count:].mean(axis=1)
         ends = jnp.max(relay), jnp.min(relay)
         H, M, spread = (x[-count - 1 : -1] for x in (steps.field, steps.magnetization, steps.spread))
@@ -125,8 +125,8 @@ class Rows:
     """What every line of some recordings, (recordings, lines) of each array, asks of their marches and of what is read.
 
     `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (7, samples), see `SIGNALS`; `read`:
-    (parameters,), of those behind the march; `taken`: the samples of the march at the ends of its steps, as all that follow
-    (`ends_taken`); `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom
+    (parameters,), of those behind the march; `stored`: the samples of what is stored of the march at the ends of its steps, as all that follow
+    (`ends_taken`), and `taken`: those of the whole march; `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom
     of the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`: (samples, 2), of applied field and
     current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see `magnetize`; `moving`:
     (parameters,), of those of the march; `mean`: (), of what is added to M of all samples.
@@ -135,6 +135,7 @@ class Rows:
     marched: Marched
     signals: np.ndarray
     read: np.ndarray
+    stored: np.ndarray
     taken: np.ndarray
     own: np.ndarray
     known: np.ndarray
@@ -148,7 +149,7 @@ class Rows:
         steps, found = self.marched.steps, []
         for r, (maxima, minima) in enumerate(steps.corners):
             corners, relay = len(maxima), steps.relay_field[r]
-            fixed, field, rising = (x.ravel() for x in (steps.threshold[r], relay[self.taken], steps.rising[r]))
+            fixed, field, rising = (x.ravel() for x in (steps.threshold[r], relay[self.stored], steps.rising[r]))
             alpha = np.concatenate([np.where(rising, field, fixed), maxima, maxima])
             beta = np.concatenate([np.where(rising, fixed, field), [basis.low], minima[:-1], minima])
             sign = np.concatenate([np.where(rising, 2.0, -2.0), np.full(corners, 2.0), np.full(corners, -2.0)])
@@ -234,4 +235,4 @@ def _gathered(back: Backward, passed, signals, read) -> Rows:
     moving = (sum(p.parameters for p in passed) + first[:, shells + 2 :]).swapaxes(1, 2)
     mean = signals[:, :, 1].sum(axis=-1)
     marched = dataclasses.replace(back.marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
-    return Rows(marched, signals, read, back.taken, own, known[..., : older - 1], drive, disturbed, moving, mean)
+    return Rows(marched, signals, read, back.stored, back.taken, own, known[..., : older - 1], drive, disturbed, moving, mean)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from magjax.chain import Timeline
+from magjax.chain.coupled import KEPT_FIRST, KEPT_LAST
 from magjax.preisach import Preisach
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
@@ -165,7 +166,8 @@ def period_grids(spectra, samples: int, periods, apart: bool = True) -> tuple[Gr
 
 
 class Predictor(eqx.Module):
-    """Predicted reading harmonics of all recordings for an actuator: of the last of the `periods` simulated on each grid."""
+    """Predicted reading harmonics of all recordings for an actuator: of the last of the `periods` simulated on each grid; of one grid
+    `times`, where that is many and no number for the compiler (`for_any`)."""
 
     drives: tuple[jax.Array, ...]
     steps: tuple[jax.Array, ...]
@@ -174,6 +176,7 @@ class Predictor(eqx.Module):
     periods: tuple[int, ...] = eqx.field(static=True)
     corners: int = eqx.field(static=True)
     until: tuple[float, int] | None = eqx.field(static=True, default=None)
+    times: jax.Array | None = None
 
     @staticmethod
     def build(spectra, samples: int, harmonics: int, periods, corners: int, apart: bool = True, until=None) -> "Predictor":
@@ -205,7 +208,8 @@ class Predictor(eqx.Module):
         def one(periods, drive, dt, level):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
             line = Timeline(dt, drive.shape[0], True)
-            return march_chain(shifted, line, driven_current(actuator, drive, line), periods, self.corners, until=self.until)[:3]
+            until = self.until if self.times is None else (None, self.times)
+            return march_chain(shifted, line, driven_current(actuator, drive, line), periods, self.corners, until=until)[:3]
 
         order = np.asarray(self.index)
         levels = jnp.zeros(len(order)) if levels is None else levels
@@ -228,6 +232,17 @@ class Predictor(eqx.Module):
                 part = dataclasses.replace(self, drives=(drives[some],), steps=(steps[some],), periods=(periods,), index=tuple(range(rows)))
                 yield part, members[at + first : at + min(first + rows, len(drives))]
             at += len(drives)
+
+    def for_any(self) -> "Predictor":
+        """The same of one grid with `times` in place of many periods: marches of 8, 14 and 24 share their programs."""
+        (periods,) = self.periods
+        if periods <= KEPT_FIRST + KEPT_LAST:
+            return self
+        return dataclasses.replace(self, periods=(KEPT_FIRST + KEPT_LAST,), times=np.asarray(periods))
+
+    def behind(self) -> "Predictor":
+        """The same for what is behind the march: it does not know how that went."""
+        return dataclasses.replace(self, periods=(1,) * len(self.periods), corners=0, until=None, times=None)
 
     def lines_of_each(self, actuators, levels):
         """As `self(actuator, levels)` for several actuators, the leading axis of every array: (actuators, recordings, harmonics + 1).

@@ -73,7 +73,7 @@ class Passes:
         z = np.asarray(z, float)
         parameters = self.read.at(z)
         lines = [
-            np.asarray(_read(self.read.actuator, self.read.names, parameters, part, marched))[: len(places)]
+            np.asarray(_read(self.read.actuator, self.read.names, parameters, part.behind(), marched))[: len(places)]
             for part, places, marched in self._marched(z, predictor)
         ]
         return np.concatenate(lines)[self.order]
@@ -88,12 +88,12 @@ class Passes:
         return [rows[k] for k in self.order]
 
     def magnetizations(self, z):
-        """Magnetization of every recording over all periods of the coarse grid, A/m: [(periods, samples)]."""
+        """Magnetization of every recording over the periods of the coarse grid, of many the first two and the last three, A/m: [(periods, samples)]."""
         z, predictor, found = np.asarray(z, float), self.problem.predictors[0], []
         point = self._point(z)
         for part, places in predictor.batches():
-            steps = marched_steps(self.march.actuator, self.march.names, self._of(point, z, part, places), part).steps
-            found += list(np.asarray(steps.magnetization)[: len(places), 1:].reshape(len(places), *part.periods, -1))
+            steps = self._steps(point, z, part, places).steps
+            found += list(np.asarray(steps.magnetization)[: len(places), 1:].reshape(len(places), -1, part.drives[0].shape[1]))
         return [found[k] for k in self.order]
 
     def jacobian(self, z) -> np.ndarray:
@@ -124,30 +124,33 @@ class Passes:
         z, predictor = np.asarray(z, float), self.problem.predictors[0]
         point = self._point(z)
         for part, places in predictor.batches():
-            marched = marched_steps(self.march.actuator, self.march.names, self._of(point, z, part, places), part)
+            marched = self._steps(point, z, part, places)
             read = self.read_rows(z, part, (marched.field, marched.magnetization, marched.spread))
             number = len(places)  # the last is repeated
             yield part, places, rows_of(*(jax.tree.map(lambda x, n=number: np.asarray(x)[:n], k) for k in (marched, *read)))
 
     def read_rows(self, z, part, marched):
         """The lines of a part of the recordings by the signals behind the march, and by parameters there: see `adjoint.read_rows`."""
-        return read_rows(self.read.actuator, self.read.names, self.read.at(np.asarray(z, float)), part, marched)
+        return read_rows(self.read.actuator, self.read.names, self.read.at(np.asarray(z, float)), part.behind(), marched)
 
     def compiling(self, z) -> list:
         """What a fit from z compiles, as calls that do not wait for each other."""
         z = np.asarray(z, float)
         part, places = next(self.problem.predictors[0].batches())
-        there, still = self._of(self._point(z), z, part, places), np.zeros(part.drives[0].shape)
+        point, still = self._point(z), np.zeros(part.drives[0].shape)
         return [
             lambda _: self.residual(z),
-            lambda _: marched_steps(self.march.actuator, self.march.names, there, part),
+            lambda _: self._steps(point, z, part, places),
             lambda _: self.read_rows(z, part, (still, still, still)),
         ]
+
+    def _steps(self, point, z, part, places):
+        return marched_steps(self.march.actuator, self.march.names, self._of(point, z, part, places), part.for_any())
 
     def _marched(self, z, predictor):
         point = self._point(z)
         for part, places in predictor.batches():
-            yield part, places, _march(self.march.actuator, self.march.names, self._of(point, z, part, places), part)
+            yield part, places, _march(self.march.actuator, self.march.names, self._of(point, z, part, places), part.for_any())
 
     def _point(self, z) -> Point:
         n = self.problem.layout.density_unknowns

@@ -45,8 +45,9 @@ class Backward:
         self.slopes = steps.slopes.swapaxes(2, 3)  # (recordings, steps, in, out)
         self.marks = slice(self.size - marks, self.size)  # states of effects, of which the end of a later period asks
         total = steps.relay_field.shape[1] - 1
-        self.taken = ends_taken(total + 1, samples)
-        self.before, self.place, self.turned = (total - self.count) // samples, steps.place, np.zeros((self.number, 0), int)
+        periods = int(steps.periods[0])  # some of which may not be stored
+        self.stored, self.taken = ends_taken(total + 1, samples), ends_taken(periods * samples + 1, samples)
+        self.before, self.place, self.turned = periods - self.count // samples, steps.place, np.zeros((self.number, 0), int)
         self.first = AT_FIRST * samples if self.before else 0  # steps that are gone through by themselves
         if self.before:
             step, between = (

@@ -117,7 +117,7 @@ def _behind(classes, predictor, actuator, signals, readings):
             shapes = shape_grid(c, readings)
             stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *(c(**s) for s in shapes))
             asked += [(c, s) for s in shapes]
-            rows += late_change(stacked, predictor, actuator, signals)
+            rows += late_change(stacked, predictor.behind(), actuator, signals)
     return asked, [np.concatenate(x) for x in zip(*rows, strict=True)]
 
 
@@ -135,7 +135,7 @@ def _before(classes, trials, predictor, own, path, rows):
                 (change,) = in_step_change(c(**shapes), predictor, plain, path, c.amplitude in shapes)
                 found.setdefault(True, []).append(((c, shapes), [np.asarray(x)[:number] for x in change]))
             else:
-                (change,) = drive_change(c(**shapes), predictor, plain)
+                (change,) = drive_change(c(**shapes), predictor.behind(), plain)
                 found.setdefault(False, []).append(((c, shapes), np.asarray(change)[:number]))
     lines = [rows.of_steps(*(np.stack(x) for x in zip(*(change for _, change in found[True]), strict=True)))] if True in found else []
     lines += [rows.of_drive(np.stack([change for _, change in found[False]]))] if False in found else []
@@ -147,7 +147,7 @@ def _changes(classes, trials, predictor, actuator, rows, readings):
     harmonics + 1)."""
     own, number = marching(actuator), len(rows.mean)
     fields, path = trajectory(predictor, own)
-    signals = signals_of(predictor, actuator, fields)
+    signals = signals_of(predictor.behind(), actuator, fields)
     behind, late = _behind(classes, predictor, bare(actuator), signals, readings)
     before, lines = _before(classes, trials, predictor, own, path, rows)
     asked = before + behind
@@ -157,7 +157,7 @@ def _changes(classes, trials, predictor, actuator, rows, readings):
     for c in classes:
         for shapes in trials[c] if c.shells else ():
             other, _ = trajectory(predictor, own.with_effect(c(**shapes)))
-            change = lines_of(predictor, signals_of(predictor, actuator, other)) - lines_of(predictor, signals)
+            change = lines_of(predictor, signals_of(predictor.behind(), actuator, other)) - lines_of(predictor, signals)
             lines.append(change[None, :number])
             asked.append((c, shapes))
     return asked, np.concatenate(lines)

@@ -10,7 +10,7 @@ import pytest
 import magjax.effects as effects
 from fitting.demo import concealed_actuator, record
 from fitting.joint import data_jacobian, data_residual, fields
-from fitting.model import whitened
+from fitting.model import predicted_lines, whitened
 from fitting.screen import columns
 from fitting.setup import Choices, build_problem, effect_parameters, free_parameters, spectra_of
 from magjax import programs
@@ -194,3 +194,31 @@ def test_nor_does_its_screening(traced, monkeypatch):
     again = columns(*more)
     assert traced == [] and [row[:2] for row in again] == [row[:2] for row in found]
     assert len(again[0][2]) > len(found[0][2])
+
+
+def test_marches_of_many_periods_share_their_programs(traced):
+    """How often a period is marched is no number for the compiler, and what is behind the march does not know it."""
+    recordings = some(50, 200)
+    traced.clear()
+    for periods, new in ((3, ["_march", "_read", "marched_steps", "read_rows"]), (8, ["_march", "marched_steps"]), (14, [])):
+        problem, z = problem_of(recordings, periods=periods)
+        found = data_residual(problem, z)
+        slopes = data_jacobian(problem, z)
+        assert sorted(traced) == new
+        traced.clear()
+    layout, (coarse, fine) = problem.layout, problem.predictors
+    actuator = layout.actuator(problem.template, z)
+    assert slopes.shape == (len(found), len(z))
+    assert found == pytest.approx(np.asarray(whitened(predicted_lines(fine, actuator), problem.target)), rel=1e-9, abs=1e-9)
+    for M, (M_all, drive, dt) in zip(problem.passes.magnetizations(z), marched_whole(coarse, actuator), strict=True):
+        M_all = np.asarray(M_all)[1:].reshape(14, -1)
+        assert M.shape == (5, M_all.shape[1])
+        assert M == pytest.approx(np.concatenate([M_all[:2], M_all[-3:]]), rel=1e-9)
+
+
+def marched_whole(predictor, actuator):
+    """M of every sample of all periods."""
+    from fitting.columns import trajectory
+
+    (path,) = trajectory(predictor, actuator)[1]
+    return [tuple(np.asarray(x)[k] for x in path[1:]) for k in range(len(path[0]))]

@@ -25,6 +25,7 @@ from .loops import tied
 from .newton import LOSSES, Posed, extra_of, extra_terms, solve_with_effects, trial_of
 
 SCHEMES = ("bdf2", "trapezoid")
+KEPT_FIRST, KEPT_LAST = 2, 3  # periods of a march of many that are kept whole
 
 
 class _Carry(eqx.Module):
@@ -160,12 +161,32 @@ def run_march(march: March, applied, current, disturbance=None, period: int = 0)
     return *whole, carry.memory.overflow.any()
 
 
+def run_many(march: March, applied, current, times):
+    """A period marched `times` times, a number that what is compiled does not know: more than `KEPT_FIRST + KEPT_LAST` of them.
+
+    `applied`, `current`: one period and its first sample again, (period + 1,); `march`: of that `period`. Returns the rows of
+    `march.advance` at the ends of the steps of the first KEPT_FIRST periods and of the last KEPT_LAST, one after the other.
+    """
+    count, kept = len(applied) - 1, KEPT_FIRST + KEPT_LAST
+    drive = (applied[1:], current[1:], _ends_of_periods(count + 1, count))
+
+    def again(k, state):
+        carry, rows = jax.lax.scan(march.advance, state[0], drive)
+        place = jnp.where(k < KEPT_FIRST, k, jnp.where(k < times - KEPT_LAST, kept - 1, k - times + kept))  # those between are written over
+        return carry, jax.tree.map(lambda x, new: x.at[place].set(new), state[1], rows)
+
+    one = jax.eval_shape(lambda carry: jax.lax.scan(march.advance, carry, drive)[1], march.carry)
+    room = jax.tree.map(lambda x: jnp.zeros((kept, *x.shape), x.dtype), one)
+    rows = jax.lax.fori_loop(0, times, again, tied((march.carry, room), applied))[1]
+    return jax.tree.map(lambda x: jnp.reshape(x, (kept * count, *x.shape[2:])), rows)
+
+
 def run_until_steady(march: March, applied, current, tolerance, most):
     """The last of so many repetitions of a period that the next would be the same, from its second sample to its first.
 
     `applied`, `current`: one period and its first sample again, (period + 1,); `march`: of that `period`. It goes on until
     H + M in the second half of a period, behind its extrema, differs from the period before by less than `tolerance` of its
-    peak to peak, or `most` periods are through. Returns field H, magnetization M, its spread, relay field, residual,
+    peak to peak (None: however much that is), or `most` periods are through. Returns field H, magnetization M, its spread, relay field, residual,
     (period,) each, overflow, and the last such difference. Not for reverse-mode derivatives.
     """
     count = len(applied) - 1
@@ -173,7 +194,7 @@ def run_until_steady(march: March, applied, current, tolerance, most):
 
     def going(state):
         _, _, change, number = state
-        return (change > tolerance) & (number < most)
+        return (number < most) if tolerance is None else (change > tolerance) & (number < most)
 
     def again(state):
         carry, (H0, M0, *_), _, number = state

@@ -17,7 +17,7 @@ from jax.lax import stop_gradient
 
 from ..preisach.memory import Memory, apply_field, branch_magnetization
 from .closed_form import pushed, unmoved
-from .coupled import _at_rest, _ends_of_periods, _law, _rested, march_of, run_march
+from .coupled import _at_rest, _ends_of_periods, _law, _rested, march_of, run_many, run_march
 from .loops import tied
 from .newton import stop_gradient_trial
 
@@ -188,6 +188,7 @@ class Steps(eqx.Module):
     `ended`: (periods, d, states), of the state after the last step of every period by what the states of effects were a period earlier
     (`coupled._settle`), of none where no effect is slow; they stand last in a state. `rest`: (d, shells + 2 + parameters), of the first
     state by (M of the relays, applied field, current, parameters).
+    `periods`: marched; of many that were `times` asked for the arrays over (steps + 1,) hold the first KEPT_FIRST and the last KEPT_LAST alone.
     `corners`: (2, corners), fields of maxima and minima before the first step; `moved`: (before, 2), of the older places by the applied field
     of the first sample. `field`, `magnetization`, `spread`: H, M and the variance of M over the section, (steps + 1,), `relay_field`: (steps + 1, shells), A/m.
     """
@@ -204,6 +205,7 @@ class Steps(eqx.Module):
     magnetization: jax.Array
     spread: jax.Array
     relay_field: jax.Array
+    periods: jax.Array
 
 
 DISTURBED = 3  # numbers of a disturbance
@@ -217,8 +219,9 @@ def ends_taken(samples: int, period: int) -> np.ndarray:
     return ends if len(ends) <= first + period else np.concatenate([ends[:first], ends[-period:]])
 
 
-def linearized(made, parameters, applied, current, h, corners: int, scheme: str, period: int) -> Steps:
+def linearized(made, parameters, applied, current, h, corners: int, scheme: str, period: int, times=None) -> Steps:
     """The steps of a march; `made(parameters)`: the actuator, `parameters`: (parameters,); the rest as in `magnetize`.
+    `times`: of how many periods it is, more than KEPT_FIRST + KEPT_LAST, where the drive is given over as many as these.
 
     Its derivatives by the drive, the density, the parameters and what effects add are products of these few numbers. Of a
     long march they are those of the first periods and the last: what takes so long to repeat changes little from one to the next.
@@ -238,7 +241,10 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
         return then, (_flat(carry)[0], ravel_pytree(carry.marks)[0], *relays, *row[:3])
 
     ends = _ends_of_periods(len(applied), period)
-    flat, marks, *rows = jax.lax.scan(advance, tied(march.carry, applied), (applied[1:], current[1:], ends))[1]
+    if times is None:
+        flat, marks, *rows = jax.lax.scan(advance, tied(march.carry, applied), (applied[1:], current[1:], ends))[1]
+    else:
+        flat, marks, *rows = run_many(march._replace(advance=advance), applied[: period + 1], current[: period + 1], times)
     first = (x * jnp.ones(shells) for x in (memory.field, memory.magnetization))
     v, m, H, M, spread = (jnp.concatenate([x[None], y]) for x, y in zip((*first, *(x.mean() for x in march.first[:3])), rows, strict=True))
     begun, taken = jnp.stack([applied[0], current[0]]), ends_taken(len(applied), period)
@@ -277,7 +283,8 @@ def linearized(made, parameters, applied, current, h, corners: int, scheme: str,
     begin = jnp.concatenate([m[0], begun, parameters])
     moved = jax.jacfwd(lambda x: _places(table, apply_field(table, start, x), 1))(begun[0])
     ends_of_memory = jnp.stack([memory.maxima, memory.minima])
-    return Steps(slopes, ended, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, spread, v)
+    periods = jnp.asarray((len(v) - 1) // period if times is None else times)
+    return Steps(slopes, ended, known.place, known.rising, known.threshold, jax.jacfwd(rested)(begin), ends_of_memory, moved, H, M, spread, v, periods)
 
 
 class _Rest(NamedTuple):
