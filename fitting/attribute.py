@@ -67,8 +67,11 @@ def excess_of(result, at_noise: float = AT_NOISE) -> float:
 
 # known rivals to first order whose score says little once the base has bent to the other: tried wherever that one is
 LAGS = ("amplifier_lag", "sensor_lag", "transport_delay")
-# a strain linear in M has no score where the density makes all of its first order; its square is what a quartic term takes up
-COMPANIONS = {**dict.fromkeys(("second_eddy_path", *LAGS), LAGS), "quartic_magnetostriction": ("linear_strain",)}
+# a strain linear in M has no score where the density makes all of its first order; what is left of it others of the same kind take up
+COMPANIONS = {
+    **dict.fromkeys(("second_eddy_path", *LAGS), LAGS),
+    **dict.fromkeys(("quartic_magnetostriction", "strain_hysteresis", "sensor_nonlinearity"), ("linear_strain",)),
+}
 # the density bends to them further than its tangent tells, and a rough one scores as they do
 LIKE_DENSITY = ("mean_field", "reversible_magnetization", "accommodation")
 FEEDBACKS = ("stress_feedback",)  # its column says little where the base has bent to it: tried wherever it scores

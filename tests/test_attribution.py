@@ -24,6 +24,7 @@ from fitting.screen import Candidate
 from fitting.search import Reached
 from fitting.setup import Choices
 from fitting.task import Task
+from fitting.trials import _needless
 from fitting.uncertainty import Estimate
 from fitting.verdict import _grouped, dominant, first_alone, followed, too_little, unconfirmed
 from magjax.bench import load_bench
@@ -301,10 +302,13 @@ def test_a_feedback_beside_the_noise_is_begun_from_a_springs_size_too(left, star
 
 
 def test_a_linear_strain_is_tried_beside_a_quartic_one_whatever_it_scores():
-    """A strain linear in part was called quartic: the density makes its first order."""
+    """A strain linear in part was called quartic, and one of tanh a hysteresis of the strain: the density makes its first order."""
     quartic, linear = candidate("quartic_magnetostriction", -5.8), candidate("linear_strain", 0.2, (0, 1, 0), visibility=1e-5)
     assert names(family(quartic, [quartic, linear], {quartic.name})) == ["linear_strain"]
-    assert names(family(candidate("strain_hysteresis", 9.0), [linear], set())) == []
+    for other in ("strain_hysteresis", "sensor_nonlinearity"):
+        assert names(family(candidate(other, 9.0), [linear], set())) == ["linear_strain"]
+        assert not _needless(linear, [trial(other, 0.85)])  # which ends no fit of it
+    assert names(family(candidate("duffing_stiffness", 9.0), [linear], set())) == [] and _needless(linear, [trial("duffing_stiffness", 0.85)])
 
 
 def test_rivals_where_the_best_is_not_the_whole_truth():
