@@ -10,7 +10,7 @@ import numpy as np
 from .finer import REFINE_BELOW
 
 REPEATS = 3e-4  # of the magnetization's peak to peak, that the last period may still be off
-LADDER = (3, 8, 14, 24)  # periods simulated; few numbers, for each has programs of its own
+LADDER = (3, 8, 14, 24)  # periods simulated; few numbers, for a screening has programs of its own for each
 ROUNDED = 1e-9  # of M: a loop that is no higher has none
 MATTERS = 0.03  # of the misfit, that what has not settled may make up: physics that is left out may leave hundreds of times the noise
 FALLS = 0.1, 0.95  # what is left falls to at least and at most so much of itself by a period: of three alone one knows it poorly

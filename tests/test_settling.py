@@ -55,7 +55,7 @@ def test_a_loop_without_height_is_settled():
 
 
 def test_the_fast_ones_keep_the_least_and_the_slow_ones_share_the_most():
-    """As many programs as there are numbers of periods: two."""
+    """As many grids as there are numbers of periods: two."""
     rows = [settling(3, 1e-9, 0.1), settling(8, 1e-9, 0.1), settling(8, 0.1, 0.9), settling(3, 0.1, 0.5)]
     assert periods_asked(problem(rows, 3, 8, 8, 3), None) == (3, 24, 24, 24)
 
