@@ -24,8 +24,8 @@ CLOSE = 0.8  # share of the best score that makes a close rival
 MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
 BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
-WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much, or to
-FORM_ERROR = 0.005  # of what the effects found before them take: as little as that is left by the form of their laws
+FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
+WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much or that form of the others
 UNCONFIRMED_TIE = (0.3, 50.0)  # the same where check recordings are missed as far with the best as without
 SAME_DIRECTION = 0.97
 OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law imitates another
@@ -230,6 +230,11 @@ def rivals_of(best: Trial, trials, near=WEAK_TIE, others: float = 0.0) -> list[T
     """
     tied = [t for t in trials if t is not best and t.physical and tie_of(best, t, near, others)]
     return sorted([best, *tied], key=lambda t: t.bic_change)
+
+
+def worth_ending(others: float) -> float:
+    """How far behind the best a trial may end, chi2, for it to be worth its end: twice as far as a rival; `others`: as of `rivals_of`."""
+    return max(2 * WEAK_TIE[1], FORM_ERROR * others)
 
 
 def taken_beside(steps, index=None) -> float:

@@ -75,7 +75,7 @@ def ties_of(evidence) -> dict:
         others = taken_beside(steps, k)
         for t in rivals if len(rivals) > 1 else ():
             result = evidence.reached.current if t is best else t.result
-            why = "" if t is best else tie_of(best, t, others=others) or tie_of(best, t, UNCONFIRMED_TIE)
+            why = "" if t is best else tie_of(best, t, others=others) or tie_of(best, t, UNCONFIRMED_TIE, others)
             ties[t.name] = {"chi2_per_sample": result.chi2_per_sample, "why": why}
     return ties
 

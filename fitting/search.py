@@ -20,6 +20,7 @@ from .attribute import (
     leaders,
     rivals_of,
     taken_beside,
+    worth_ending,
 )
 from .check import check_errors
 from .diagnosis import SILENT_CHI2
@@ -127,7 +128,7 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
         excess = max(excess_of(state.current), MIN_DROP)
         if state.steps and _hopeless(state.current, top[0], excess):
             break
-        trials = try_all(task, state.current, top, candidates, excess, state.under_way)
+        trials = try_all(task, state.current, top, candidates, excess, state.under_way, worth_ending(taken_beside(state.steps)))
         state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good, best = _best_of(trials, hidden)

@@ -31,13 +31,13 @@ IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 
 
-def try_all(task, current, top, candidates, excess, under_way) -> list[Trial]:
+def try_all(task, current, top, candidates, excess, under_way, near: float = 2 * WEAK_TIE[1]) -> list[Trial]:
     """The leaders fitted beside the current fit, two side by side, until one meets the noise; then the family of the best.
-    `under_way`: a dict that is given each trial by name as soon as it has ended."""
+    `under_way`: a dict that is given each trial by name as soon as it has ended; `near`: as of `worth_ending`."""
     trials = []
 
     def useful(*others):
-        return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + 2 * WEAK_TIE[1]
+        return min((chi2_of(t.result) for t in (*trials, *others) if t.physical), default=np.inf) + near
 
     def kept(trial):
         under_way[trial.name] = trial

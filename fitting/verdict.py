@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.words import sized
 
-from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, rivals_of
+from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
 from .check import check_errors, foretold_text
 from .diagnosis import Diagnosis, Evidence, least_excess, misfit
 from .experiments import INSTRUMENTS, instrument_request
@@ -196,7 +196,9 @@ def followed(evidence, first, after: float) -> bool:
 
 def unconfirmed(reached):
     """The same with more rivals to the effects found, where check recordings are missed as far with them as without."""
-    steps = [(best, rivals_of(best, good, UNCONFIRMED_TIE), good, previous) for best, _, good, previous in reached.steps]
+    beside = [taken_beside(reached.steps, k) for k in range(len(reached.steps))]
+    known = zip(reached.steps, beside, strict=True)
+    steps = [(best, rivals_of(best, good, UNCONFIRMED_TIE, others), good, previous) for (best, _, good, previous), others in known]
     return dataclasses.replace(reached, steps=steps)
 
 

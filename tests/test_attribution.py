@@ -834,7 +834,7 @@ def test_what_makes_up_for_the_form_of_a_law_is_modelled_and_not_named(monkeypat
     base = trial("excess_loss", begun).result
     ends = {"excess_loss": met, "rate_dependent_switching": left}  # beside it
 
-    def fitted(task, current, top, candidates, excess, so_far):
+    def fitted(task, current, top, candidates, excess, *more):
         name = "excess_loss" if current is base else "rate_dependent_switching"
         return [trial(name, ends[name], base=current.chi2_per_sample)]
 

@@ -172,7 +172,7 @@ def test_of_a_round_that_was_ended_the_best_trial_is_kept_where_a_full_round_wou
     plain, first, second = a_fit(1e3, 58.0), a_fit(13.0, 60.0, "creep"), a_fit(left, 62.0, "creep", "backlash")
     rounds = iter([[trial("creep", first, 98700.0)], None])
 
-    def trials(task, current, top, candidates, excess, under_way):
+    def trials(task, current, top, candidates, excess, under_way, near):
         if ended := next(rounds):
             return ended
         under_way["backlash"] = trial("backlash", second, taken)
