@@ -129,7 +129,7 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
     if candidate.name in FEEDBACKS:  # the base's density has bent to do what it does: not from there
         result = task.fit(actuator, choices=base.choices, spectra=base.spectra, refine=False, target=target)
         if base.chi2_per_sample < MISFIT:  # later nothing is left that asks for further starts
-            further = [task.fit_on(base, base.actuator.with_effect(e), target=target) for e in effect_class.elsewhere()]
+            further = [task.fit_on(base, base.actuator.with_effect(e), target=target) for e in effect_class.elsewhere(base.actuator)]
             result = min(result, *further, key=finite_chi2)
     else:
         result = task.fit_on(base, actuator, target=target)
@@ -195,7 +195,7 @@ def _details(trial):
 def _further_starts(base, trial):
     """Effects to begin a further fit with, each with the fit to go on from: with details, and from elsewhere."""
     effect = trial.result.actuator.effect(trial.name)
-    return _details(trial) + [(other, base) for other in effect.elsewhere()]
+    return _details(trial) + [(other, base) for other in effect.elsewhere(base.actuator)]
 
 
 def credited(candidate, result, base, effect, excess) -> Trial:

@@ -1291,3 +1291,16 @@ def test_what_goes_with_a_later_effect_is_sought_anew_where_checks_are_missed(mo
     made = module._promised_anew(task, current, current, {"creep", *known}, ["check"])
     assert sorted(found) == sorted(tried) and len(made) == len(tried)
     assert module._promised_anew(task, current, current, {"creep"}, ()) == []
+
+
+def test_a_second_mode_begins_as_two_about_the_rods_own_too():
+    """A mass on a spring that rode on the rod was fitted to 38 of the noise from the screening's start, and is met from there (0.9)."""
+    from magjax.bench import load_bench
+
+    rod = load_bench("aa-050h").actuator()
+    (start,) = CLASSES["second_mode"].elsewhere(rod)
+    assert float(start.f2) == pytest.approx(0.7 * float(rod.mechanics.f0)) and float(start.gain) > 0 > float(start.lead)
+    assert CLASSES["second_mode"].elsewhere(SimpleNamespace(mechanics=None)) == ()
+    result = SimpleNamespace(actuator=rod.with_effect(CLASSES["second_mode"](gain=0.1)))
+    begun = fitting.attribute._further_starts(SimpleNamespace(actuator=rod), SimpleNamespace(name="second_mode", result=result))
+    assert [float(e.lead) for e, _ in begun][-1] == -0.5

@@ -100,8 +100,9 @@ class AbstractEffect(eqx.Module):
         return True
 
     @classmethod
-    def elsewhere(cls) -> tuple:
-        """Where else a fit may begin, far from the null, for laws whose first order misleads: effects with all their parameters."""
+    def elsewhere(cls, actuator) -> tuple:
+        """Where else a fit may begin, far from the null, for laws whose first order misleads: effects with all their parameters, beside those
+        of an actuator."""
         return ()
 
     @classmethod

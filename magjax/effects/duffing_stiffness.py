@@ -39,7 +39,7 @@ class DuffingStiffness(AbstractEffect):
     amplitude = "k3"
 
     @classmethod
-    def elsewhere(cls):
+    def elsewhere(cls, actuator):
         """A spring that is at rest within the stroke: about its null its stiffening looks like a softening."""
         return (cls(k3=0.6, rest=0.35),)
 

@@ -29,6 +29,13 @@ class SecondMode(AbstractEffect):
     signature = "linear in the forcing: a resonance in the harmonics near f2, whichever drive makes them"
     amplitude = "gain"
 
+    @classmethod
+    def elsewhere(cls, actuator):
+        """Two modes about the one that a plain fit takes them for, as of a mass on a spring that rides on the rod: one of them alone does little."""
+        if actuator.mechanics is None:
+            return ()
+        return (cls(gain=0.3, f2=0.7 * float(actuator.mechanics.f0), xi2=0.1, lead=-0.5),)
+
     def is_itself(self) -> bool:
         """Not where it is overdamped: two lags and no mode, which imitate whatever relaxes."""
         return bool(self.xi2 < 1)

@@ -37,7 +37,7 @@ class StressFeedback(AbstractEffect):
     in_step = True
 
     @classmethod
-    def elsewhere(cls):
+    def elsewhere(cls, actuator):
         """A spring: where the density has bent to it nothing of its size shows at null."""
         return (cls(stiffness=1e10),)
 
