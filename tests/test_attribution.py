@@ -1029,7 +1029,7 @@ def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch
         asked.append(effect), targets.append(target)
         return SimpleNamespace(converged=True)
 
-    found = fitting.attribute.settled(SimpleNamespace(fit_on=fit_on), SimpleNamespace(spectra=None), plain, 1.0, 800.0)
+    found = fitting.attribute.settled(SimpleNamespace(fit_on=fit_on), SimpleNamespace(spectra=None, actuator=None), plain, 1.0, 800.0)
     assert (found is not plain) == detailed and bool(asked) == (share > 0.3)
     assert all(float(effect.stribeck) > 0 for effect in asked) and set(targets) <= {800.0}  # what others meet, these must, too
 
