@@ -379,7 +379,7 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
 
     vars(best.result).update(ended(1.0, 0.6))
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found), **ended(chi2n, strain))
-    before = SimpleNamespace(chi2_per_sample=50.0, data_count=COUNT)
+    before = SimpleNamespace(chi2_per_sample=50.0, data_count=COUNT, actuator=None)
     again, spoiled = [], []
 
     def fit(*a, choices, start, **k):
@@ -423,7 +423,7 @@ def test_a_finer_density_is_tried_beside_what_takes_nearly_all(monkeypatch, befo
     found = SimpleNamespace(choices=Choices(rest="negative"), chi2_per_sample=left, data_count=COUNT)
     monkeypatch.setattr("fitting.task.Task.fit", lambda *a, refine, **k: limits.append(refine) or found)
     task = Task((), SimpleNamespace(start="negative"), Choices(rest="negative"))
-    fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=before), best, [best], 1.0, any_rest=False)
+    fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=before, actuator=None), best, [best], 1.0, any_rest=False)
     assert limits == [pytest.approx(asked)]
 
 
@@ -441,7 +441,7 @@ def test_a_density_is_gone_on_from_where_one_from_scratch_ends_above_it(monkeypa
 
     monkeypatch.setattr("fitting.task.Task.fit", fit)
     task = Task((), SimpleNamespace(start="negative"), Choices(rest="negative"))
-    fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=8.0), best, [best], 1.0, any_rest=False)
+    fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=8.0, actuator=None), best, [best], 1.0, any_rest=False)
     assert begun == ([None, best.result] if anew else [None])
 
 
@@ -461,7 +461,7 @@ def test_steps_of_a_density_are_looked_for_anew_beside_an_effect(monkeypatch, ag
     monkeypatch.setattr(fitting.adoption, "credited", lambda c, result, *a: dataclasses.replace(best, result=result))
     stepped = Choices(knots=(26, 18), rest="negative", stiffness=Stiffness(np.ones(3), (), (26, 18), 0.0, 1.0))
     task = Task((), SimpleNamespace(start="negative", drive="current"), stepped)
-    found, _, then = fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=1.0), best, [best], 1.0, any_rest=False)
+    found, _, then = fitting.adoption.refitted(task, SimpleNamespace(chi2_per_sample=1.0, actuator=None), best, [best], 1.0, any_rest=False)
     assert begun[0] == (Choices().knots, None)
     assert (found.result is even, then.choices.stiffness is None) == (taken, taken)
 
@@ -480,7 +480,7 @@ def test_the_finest_hats_are_tried_beside_what_leaves_much_that_nothing_promises
     monkeypatch.setattr("fitting.task.fit_or_stop", fit)
     monkeypatch.setattr(fitting.adoption, "credited", lambda c, result, *a: dataclasses.replace(best, result=result))
     task = Task((), SimpleNamespace(start="negative", drive="current"), Choices(rest="negative"))
-    before = SimpleNamespace(chi2_per_sample=92.2)
+    before = SimpleNamespace(chi2_per_sample=92.2, actuator=None)
     found, _, then = fitting.adoption.refitted(task, before, best, [best], 1.0, any_rest=False, any_density=not promised)
     assert asked == ([] if promised else [(48, 32)] * (2 if taken else 1))  # near rivals are fitted on them, too: here the best itself
     assert (then.choices.knots == (48, 32), found.result is finest) == (taken, taken)
