@@ -196,9 +196,10 @@ def followed(evidence, first, after: float) -> bool:
 
 def unconfirmed(reached):
     """The same with more rivals to the effects found, where check recordings are missed as far with them as without."""
-    beside = [taken_beside(reached.steps, k) for k in range(len(reached.steps))]
-    known = zip(reached.steps, beside, strict=True)
-    steps = [(best, rivals_of(best, good, UNCONFIRMED_TIE, others), good, previous) for (best, _, good, previous), others in known]
+    steps = [
+        (best, rivals_of(best, good, UNCONFIRMED_TIE, taken_beside(reached.steps, k)), good, previous)
+        for k, (best, _, good, previous) in enumerate(reached.steps)
+    ]
     return dataclasses.replace(reached, steps=steps)
 
 

@@ -17,7 +17,7 @@ from jax.lax import stop_gradient
 
 from ..preisach.memory import Memory, apply_field, branch_magnetization
 from .closed_form import pushed, unmoved
-from .coupled import _at_rest, _ends_of_periods, _law, _rested, march_of, run_many, run_march
+from .coupled import KEPT_FIRST, _at_rest, _ends_of_periods, _law, _rested, march_of, run_many, run_march
 from .loops import tied
 from .newton import stop_gradient_trial
 
@@ -210,7 +210,7 @@ class Steps(eqx.Module):
 
 DISTURBED = 3  # numbers of a disturbance
 BEYOND = 1e-7  # of the range of a period, by which each goes beyond the one before where there are many: more than steps are solved to
-AT_FIRST = 2  # periods that are taken to first order one by one: of a longer march the last stands for all after these
+AT_FIRST = KEPT_FIRST  # periods that are taken to first order one by one: of a longer march the last stands for all after these
 
 
 def ends_taken(samples: int, period: int) -> np.ndarray:
