@@ -283,6 +283,13 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     with contextlib.suppress(Late):
         told = told_by_checks(task.sparing, reached.current, reached.foretell)
     if told is not None:
+        other = None
+        with contextlib.suppress(Late):
+            other = _plain_there(task.sparing, plain, told) if reached.steps else None
+        if other is not None:
+            remembered = task.on(choices=dataclasses.replace(task.choices, rest=told.choices.rest))
+            found = _examined(remembered, measured, adopted, check, other, before_zeros, zeros)
+            return found.noted(MEMORY_TEXT.format(STATES[told.choices.rest]))
         plain, raw = (plain, raw) if reached.steps else (told, raw if adopted else told)
         reached = dataclasses.replace(reached, current=told)
     evidence = Evidence(
@@ -361,12 +368,22 @@ def _better_valley(task, plain, candidates, current):
     if drop < UNPROMISED * max(c.z**2 for c in candidates):
         return None
     task.say("the plain model from there", current.chi2_per_sample)
-    held = {e.name for e in plain.actuator.effects}
-    actuator = current.actuator
-    for effect in current.actuator.effects:
-        actuator = actuator if effect.name in held else actuator.without_effect(effect.name)
-    better = task.fit_on(current, actuator, choices=current.choices)
+    better = task.fit_on(current, _without_found(current, plain), choices=current.choices)
     return better if chi2_of(better) < chi2_of(plain) - max(MIN_DROP, VALLEY * drop) else None
+
+
+def _plain_there(task, plain, told):
+    """The plain fit from the start memory that check recordings told beside effects, where it leaves less than from its own: then these
+    may have made up for that. None elsewhere."""
+    task.say("the plain model from that start memory", told.chi2_per_sample)
+    other = task.fit_on(plain, _without_found(told, plain), choices=dataclasses.replace(plain.choices, rest=told.choices.rest))
+    return other if chi2_of(other) < chi2_of(plain) - MIN_DROP else None
+
+
+def _without_found(found, plain):
+    """The actuator of a fit without the effects that the plain one has not."""
+    held = {e.name for e in plain.actuator.effects}
+    return functools.reduce(lambda a, e: a if e.name in held else a.without_effect(e.name), found.actuator.effects, found.actuator)
 
 
 def _screened_finer(task, base, candidates, free):

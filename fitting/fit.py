@@ -24,7 +24,7 @@ from .finer import (
     hats_of_step,
 )
 from .joint import compiled, data_residual, prior_matrix, solve
-from .memories import apart, best_memory, rests_of, settled
+from .memories import apart, best_memory, is_strained, rests_of, settled
 from .outcome import (
     AT_BOUND,
     LOST,
@@ -150,7 +150,8 @@ def _density_of(problem, solution):
 def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):
     """The fit from each start memory until one meets the noise; the best of them. The first by itself, then the others side by side.
 
-    One that the bench does not state is taken only where it meets the noise and none that it states does.
+    One that the bench does not state is taken only where it meets the noise and none that it states does. Where the best has levels
+    far from their prior, a right one may have ended in a false valley: from there the others are tried once more.
     """
     rests, others = rests_of(bench, choices)
     build = functools.partial(build_problem, spectra, actuator, bench, names)
@@ -166,7 +167,26 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
         except KeyboardInterrupt:
             known, found, tried = ended[0]
             ended = [(known, dataclasses.replace(found, converged=False, interrupted=True), tried)]
-    return best_memory([row for row in ended if row[2].rest not in others or settled(*row[:2])])
+    best = best_memory([row for row in ended if row[2].rest not in others or settled(*row[:2])])
+    if start is None and len(ended) > 1 and is_strained(*best[:2]) and not best[1].interrupted:
+        again = [row[2].rest for row in ended if row[2].rest in rests and row[1].chi2 > best[1].chi2]
+        ended = [best, *together([_from_there(best, rest, actuator, bench, names, spectra) for rest in again], report)]
+        best = best_memory(ended)
+    return best
+
+
+def _from_there(best, rest, actuator, bench, names, spectra):
+    """The fit from another start memory and the density that one ended with, its own having led nowhere; levels from their mean."""
+    problem, solution, choices = best
+    choices = dataclasses.replace(choices, rest=rest)
+    found, z = _resample(problem, solution, spectra, actuator, bench, names, choices)
+    z[len(z) - found.layout.memories :] = 0.0
+
+    def run(say):
+        progress = functools.partial(say, f"fit from {rest}")
+        return found, solve(found, z, solution.weights, max_jacobians=choices.max_jacobians, progress=progress), choices
+
+    return run
 
 
 def _solved(build, problem, z, choices, start, target, say):

@@ -12,6 +12,7 @@ STATES = {  # in words
 }  # fmt: skip
 RESTS_IN_ORDER = tuple(found[0] for found in RESTS.values())
 CALM = 0.25  # mean square of the recordings' levels in units of their prior, above which another start memory is tried
+STRAINED = 4.0  # the same above which it is most likely a wrong one; of the right one CALM at the most, of others some tens and more
 REST_SETTLED = 1.15  # chi2/N below which no other start memory is tried
 
 
@@ -37,6 +38,11 @@ def settled(problem, solution) -> bool:
     """Whether no other start memory need be tried; levels that strain their prior tell of a wrong one even where the recordings
     are met."""
     return _strain(problem, solution) <= CALM * problem.layout.memories and solution.chi2 < REST_SETTLED * problem.data_count
+
+
+def is_strained(problem, solution) -> bool:
+    """Whether the recordings' levels are as far from their prior as those beside a wrong start memory."""
+    return _strain(problem, solution) > STRAINED * problem.layout.memories
 
 
 def memory_is_told(result) -> bool:

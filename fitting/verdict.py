@@ -43,6 +43,9 @@ FORM_TEXT = " The model makes up for the form of its law by {}, which takes too 
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the {} going on."
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {} (rms) more than the model's; the means take no part in the fit."
+FREE_TEXT = (
+    " The recordings' mean levels take no part in the fit, for they differ from the model's by {} (rms): a zero that moves, or more of what is missing."
+)
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 PLAIN_TEXT = "The model offered is the plain one, which predicts the check recordings better than any repair."
 HIDDEN_TEXT = (
@@ -312,11 +315,14 @@ def _unknown(evidence, common, note: str = "") -> Diagnosis:
         f"{max(evidence.share, 0):.0%} of the excess). It acts most like the block {block}, in {region}."
     )
     unknown = {"block": block, "region": region, "explained_share": float(np.clip(evidence.share, 0, 1))}
-    # what the records alone show stands whatever the loops hold
-    records = dataclasses.replace(evidence, reached=dataclasses.replace(evidence.reached, steps=[]))
+    # what the records alone show stands whatever the loops hold; means that were set free differ from those of a model that lacks something
+    shown = tuple(pair for pair in evidence.adopted if not pair[0].shapes.get("zeros"))
+    records = dataclasses.replace(evidence, adopted=shown, reached=dataclasses.replace(evidence.reached, steps=[]))
     effects, groups, sizes, _ = found_rows(records)
     if effects or groups:
         names = " and ".join([*(e["name"] for e in effects), *(" or ".join(g) for g in groups)])
         note += f" Found beside it, in what does not repeat with the drive: {names}."
+    for effect in (e for e, _ in evidence.adopted if e.shapes.get("zeros")):
+        note += FREE_TEXT.format(sized("m", effect.amplitude, digits=2))
     told = {"rivals": sizes, "ties": ties_of(records)} if groups else {}
     return Diagnosis("unknown_at", text + note, tuple(effects), tuple(groups), unknown=unknown, **(common | told))

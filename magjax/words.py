@@ -13,5 +13,11 @@ def sized(unit: str, *values: float, digits: int = 3, joined: str = " -> ") -> s
     if unit in PREFIXED and largest > 0:
         rounded = float(f"{largest:.{digits}g}")
         prefix, factor = next(((p, f) for p, f in PREFIXES.items() if rounded >= f), ("p", 1e-12))
-    told = joined.join(f"{v / factor:.{digits}g}" for v in values)
+    told = joined.join(_plain(v / factor, digits) if unit in PREFIXED else f"{v / factor:.{digits}g}" for v in values)
     return told if unit in ("", "1") else f"{told} {prefix}{unit}"
+
+
+def _plain(value: float, digits: int) -> str:
+    """A value to so many digits, without a power of ten where it has more of them before the point: 1.4e+02 is 140."""
+    rounded = f"{value:.{digits}g}"
+    return f"{float(rounded):.0f}" if "e+" in rounded and abs(value) < 1e6 else rounded

@@ -195,6 +195,10 @@ def test_an_unknown_names_what_the_records_show_beside_the_loop(monkeypatch):
     either = fitting.verdict.verdict(dataclasses.replace(evidence, adopted=((drift, [heat]),)))
     assert either.effects == () and either.groups == (["zero_drift", "thermal_drift"],) and set(either.rivals) == set(either.groups[0])
     assert either.message.endswith("the drive: zero_drift or thermal_drift.")
+    zeros = dataclasses.replace(drift, amplitude=1.4e-7, shapes={"zeros": 1e-5})  # of a model that lacks something: no drift by themselves
+    free = fitting.verdict.verdict(dataclasses.replace(evidence, adopted=((zeros, [heat]),)))
+    assert free.effects == () and free.groups == () and free.rivals == {}
+    assert free.message.endswith("differ from the model's by 140 nm (rms): a zero that moves, or more of what is missing.")
     for found, said in ((beside, "zero drift (sensor)"), (either, "zero drift or thermal drift")):
         assert headline({"verdict": found.verdict, "unknown": found.unknown, "effects": found.effects, "groups": found.groups}).endswith(
             f"; found beside it: {said}"

@@ -1,6 +1,7 @@
 """What relays remember that a recording never reaches: start states, the static path, the fit that finds them."""
 
 import dataclasses
+import importlib
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from magjax.preisach.static import static_magnetization, static_path, static_val
 from magjax.recording import Recording
 from magjax.simulate import run_chain, simulate
 
+fit_module = importlib.import_module("fitting.fit")  # not the function
 LOW, HIGH, L = -1000.0, 1000.0, 20
 
 
@@ -176,6 +178,33 @@ def test_the_levels_tell_the_start_memory_where_much_is_amiss(ended, best):
         return known, SimpleNamespace(chi2=648 * chi2n, z=z), Choices(rest=name)
 
     assert best_memory([row(name, *found) for name, found in ended.items()])[2].rest == best
+
+
+@pytest.mark.parametrize(
+    ("ended", "again", "asked", "best"),
+    [  # a null on rough cells, 12 bits: the wrong one was followed, and mean_field named
+        ({"negative": (56.5, 0.6), "demagnetized": (23.65, 1014.0), "positive": (23.61, 2147.0)}, (23.58, 0.6), ["negative"], "negative"),
+        ({"negative": (56.5, 0.6), "demagnetized": (23.65, 1014.0), "positive": (23.61, 2147.0)}, (60.0, 0.6), ["negative"], "demagnetized"),
+        ({"negative": (56.5, 0.6), "demagnetized": (23.65, 1.9), "positive": (23.61, 2147.0)}, None, [], "demagnetized"),  # calm
+        ({"negative": (1.0, 0.1)}, None, [], "negative"),
+    ],
+    ids=["false valley", "not its valley", "calm", "settled"],
+)
+def test_another_start_memory_is_tried_from_where_a_strained_one_ended(monkeypatch, ended, again, asked, best):
+    known = SimpleNamespace(data_count=729, layout=SimpleNamespace(memories=10))
+
+    def row(rest, chi2n, strain):
+        z = np.append(np.ones(5), np.full(10, np.sqrt(strain / 10)))
+        return known, SimpleNamespace(chi2=729 * chi2n, z=z, interrupted=False), Choices(rest=rest)
+
+    there = []
+    monkeypatch.setattr(fit_module, "build_problem", lambda *a: (known, None))
+    monkeypatch.setattr(fit_module, "_solved", lambda build, problem, z, tried, *a: row(tried.rest, *ended[tried.rest]))
+    monkeypatch.setattr(fit_module, "apart", lambda rests, problem: list(rests))
+    monkeypatch.setattr(fit_module, "_from_there", lambda best, rest, *a: there.append(rest) or (lambda say: row(rest, *again)))
+    bench = SimpleNamespace(start="auto", drive="current")
+    found = fit_module._start_memories(known, None, None, bench, (), Choices(), (), None, lambda *a: None, np.inf)
+    assert found[2].rest == best and there == asked
 
 
 def of_memory(rest, chi2, strain=0.1):

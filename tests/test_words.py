@@ -33,6 +33,7 @@ def test_a_size_is_told_by_the_prefix_that_suits_it(unit, values, told):
 def test_digits_and_ranges():
     assert sized("m", 1.7061e-5, 5.2878e-5, digits=5, joined=" .. ") == "17.061 .. 52.878 um"
     assert sized("m", math.nan) == "nan m"
+    assert sized("m", 1.434e-7, digits=2) == "140 nm" and sized("Hz", 1234.0) == "1230 Hz"  # without a power of ten
 
 
 def test_the_same_error_of_many_files_is_said_once():
