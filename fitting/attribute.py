@@ -67,9 +67,11 @@ def excess_of(result, at_noise: float = AT_NOISE) -> float:
 
 # known rivals to first order whose score says little once the base has bent to the other: tried wherever that one is
 LAGS = ("amplifier_lag", "sensor_lag", "transport_delay")
+# friction and play act alike at their size, and a base that has bent to one scores either
 # a strain linear in M has no score where the density makes all of its first order; what is left of it others of the same kind take up
 COMPANIONS = {
     **dict.fromkeys(("second_eddy_path", *LAGS), LAGS),
+    **{"coulomb_friction": ("backlash",), "backlash": ("coulomb_friction",)},
     **dict.fromkeys(("quartic_magnetostriction", "strain_hysteresis", "sensor_nonlinearity"), ("linear_strain",)),
 }
 # the density bends to them further than its tangent tells, and a rough one scores as they do

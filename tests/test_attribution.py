@@ -315,6 +315,14 @@ def test_a_linear_strain_is_tried_beside_a_quartic_one_whatever_it_scores():
     assert names(family(candidate("duffing_stiffness", 9.0), [linear], set())) == [] and _needless(linear, [trial("duffing_stiffness", 0.85)])
 
 
+@pytest.mark.parametrize(("best", "other"), [("coulomb_friction", "backlash"), ("backlash", "coulomb_friction")])
+def test_friction_and_play_are_tried_wherever_the_other_is_best(best, other):
+    """A rod with play and an after-effect: friction took 83 % of it, its rival was never tried, and the diagnosis ended unknown_at."""
+    rival = candidate(other, 2.0, (0, 1, 0))
+    assert names(family(candidate(best, 150.0), [rival], set())) == [other] and not _needless(rival, [trial(best, 0.85)])
+    assert names(family(candidate(best, 150.0), [rival], {other})) == []
+
+
 def test_rivals_where_the_best_is_not_the_whole_truth():
     best, near = trial("second_mode", 2.0, base=300.0), trial("sensor_lag", 2.15, base=300.0)
     far = trial("creep", 2.5, base=300.0, direction=(0, 1, 0))
