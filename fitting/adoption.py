@@ -86,7 +86,10 @@ def refitted(task, current, best, good, excess, any_rest: bool = True, any_densi
     order = sum(rests_of(task.bench, free), ())
     any_rest = any_rest and len(order) > 1
     if any_rest and (chosen.rest != order[0] or best.result.chi2_per_sample > REST_SETTLED and not memory_is_told(best.result)):
-        other = task.fit_on(best.result, best.result.actuator, choices=free)
+        known, ended = best.result.problem, best.result.solution
+        noise = max(ended.chi2 / known.data_count, 1.0)
+        target = (against_memory([(known, ended)])[0] + MIN_DROP) * noise  # beyond it no levels, however calm, speak for another
+        other = task.fit_on(best.result, best.result.actuator, choices=free, target=target)
         margin = MIN_DROP if order.index(other.choices.rest) < order.index(chosen.rest) else -MIN_DROP
         against = against_memory([(fit.problem, fit.solution) for fit in (other, best.result)])
         if against[0] < against[1] + margin:

@@ -392,10 +392,11 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     vars(best.result).update(ended(1.0, 0.6))
     other = SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, choices=Choices(rest=found), **ended(chi2n, strain))
     before = SimpleNamespace(chi2_per_sample=50.0, data_count=COUNT, actuator=None)
-    again, spoiled = [], []
+    again, spoiled, targets = [], [], []
 
     def fit(*a, choices, start, **k):
         if choices.rest == "auto":
+            targets.append(k["target"])
             return other
         assert start is best.result  # not the plain fit, whose density belongs to another memory
         again.append(choices.rest)
@@ -408,6 +409,7 @@ def test_the_first_start_memory_stands_unless_another_is_better(monkeypatch, hel
     assert task.bench.start == "auto"
     far = trial("creep", 2.0)
     _, kept, asked = module.refitted(task, before, best, [best, far], 1.0)
+    assert targets == [pytest.approx(COUNT + 2 * 0.6**2 + 25.0)]  # of the noise, what its levels cost, and five deviations
     assert asked.choices.rest == (found if taken else held) and again == ([found] if taken else [])
     assert names(kept) == ["sensor_lag", "creep"]  # it may serve beside a later effect
     *_, fixed = module.refitted(task, before, best, [best], 1.0, any_rest=False)
