@@ -134,10 +134,10 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
             further = [task.fit_on(base, base.actuator.with_effect(e), target=target) for e in effect_class.elsewhere(base.actuator)]
             result = min(result, *further, key=finite_chi2)
     else:
-        result = task.fit_on(base, actuator, target=target)
+        result = task.fit_on(base, actuator, target=target, patient=False)
         if not chi2_of(result) < chi2_of(base) and chi2_of(base) - candidate.z**2 < target:
             nearer = effect.with_amplitude(amplitude * _no_farther(candidate, base))
-            result = min(result, task.fit_on(base, base.actuator.with_effect(nearer), target=target), key=finite_chi2)
+            result = min(result, task.fit_on(base, base.actuator.with_effect(nearer), target=target, patient=False), key=finite_chi2)
     return credited(candidate, result, base, effect, excess)
 
 

@@ -61,6 +61,7 @@ def fit(
     start=None,
     target: float = np.inf,
     spectra=None,
+    patient: bool = True,
 ) -> FitResult:
     """Fit an actuator to recordings jointly.
 
@@ -70,7 +71,7 @@ def fit(
     Masses that `bench.free` does not name are held at those of `actuator`, with its start memory.
     `progress`: called as progress(text, step, chi2 per datum); `target`: a total chi2 above which the fit is of no use and may
     end early; `spectra`: those of the recordings, where another fit of the same has them; `start`: a fit whose density and
-    weights are gone on from.
+    weights are gone on from; `patient`: with more periods, too, where it has used up its Jacobians without them.
     Returns a `FitResult`; raises `RecordingError` where a recording cannot be used and `ConfigurationError` for a wrong
     bench. Non-convergence is a result, not an exception.
     """
@@ -95,7 +96,7 @@ def fit(
     compiled(problem, z)
     warm = time.perf_counter() - begin
     asked = choices
-    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, asked, spectra, start, report, target)
+    problem, solution, choices = _start_memories(problem, z, actuator, bench, names, asked, spectra, start, report, target, patient)
     if start is None and solution.chi2 > ASTRAY * problem.data_count and not solution.interrupted:
         asked = dataclasses.replace(asked, periods=choices.periods)
         found = _with_turning(z, solution, actuator, bench, names, asked, spectra, report, target)
@@ -147,7 +148,7 @@ def _density_of(problem, solution):
     return problem.basis, solution.z[: problem.layout.density_unknowns + 1]
 
 
-def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target):
+def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target, patient: bool = True):
     """The fit from each start memory until one meets the noise; the best of them. The first by itself, then the others side by side.
 
     One that the bench does not state is taken only where it meets the noise and none that it states does. Where the best has levels
@@ -158,7 +159,7 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
 
     def run(rest, posed=None):
         tried = dataclasses.replace(choices, rest=rest)
-        return lambda say: _solved(build, *(posed or build(tried, _density(start))), tried, start, target, say)
+        return lambda say: _solved(build, *(posed or build(tried, _density(start))), tried, start, target, say, patient)
 
     ended = [run(rests[0], (problem, z))(report)]
     if not settled(*ended[0][:2]) and not ended[0][1].interrupted:
@@ -189,11 +190,12 @@ def _from_there(best, rest, actuator, bench, names, spectra):
     return run
 
 
-def _solved(build, problem, z, choices, start, target, say):
+def _solved(build, problem, z, choices, start, target, say, patient: bool = True):
     """A problem solved from z, with as many periods as it takes until they repeat: (problem, solution, choices).
 
     Where they do not, it begins anew with more, and a few Jacobians from there tell whether these are enough. A fit that goes on from
-    another, `start`, has its periods, and goes on with more where it is of use."""
+    another, `start`, has its periods, and goes on with more where it is of use; if it is not `patient`, and has not converged with those,
+    whoever asked for it says whether it is."""
     at, chi2 = z, None
     while True:
         while start is None and (periods := periods_asked(problem, at, chi2)) != problem.predictors[0].periods_of_each:
@@ -214,7 +216,7 @@ def _solved(build, problem, z, choices, start, target, say):
             target=target,
             progress=functools.partial(say, f"fit from {choices.rest}"),
         )
-        if found.interrupted or (start is not None and found.chi2 > target):
+        if found.interrupted or (start is not None and (found.chi2 > target or not (patient or found.converged))):
             return problem, found, choices
         at, chi2 = found.z, found.chi2
         periods = periods_asked(problem, at, chi2)

@@ -938,7 +938,8 @@ def test_a_start_from_which_a_fit_ends_worse_than_without_the_effect_is_taken_ne
     base.actuator = SimpleNamespace(with_effect=lambda effect: effect)
     begun = []
 
-    def fit_on(start, effect, target):
+    def fit_on(start, effect, target, patient):
+        assert not patient  # more periods where others say that they are of use
         begun.append(float(effect.gain))
         return SimpleNamespace(
             chi2_per_sample=far if len(begun) == 1 else 1.2, data_count=COUNT, actuator=SimpleNamespace(effects=()), converged=True

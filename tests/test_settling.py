@@ -107,6 +107,23 @@ def test_an_interrupt_while_periods_are_told_keeps_what_was_reached(monkeypatch)
     assert ended[0] is longer and ended[1] is stopped and ended[2].periods == (8,)
 
 
+@pytest.mark.parametrize(
+    ("converged", "patient", "periods"), [(False, True, (8,)), (False, False, (3,)), (True, False, (8,))], ids=["patient", "not", "converged"]
+)
+def test_a_trial_that_used_up_its_jacobians_waits_until_it_is_of_use(monkeypatch, converged, patient, periods):
+    """An amplifier's limit took 30 Jacobians of 3, 17 of 8 and 30 of 24 periods to end at four times what its rival met at once."""
+    module = importlib.import_module("fitting.fit")
+    monkeypatch.setattr(module, "periods_asked", lambda *_: (8,))
+    monkeypatch.setattr(module, "_weights", lambda *_: None)
+    monkeypatch.setattr(
+        module, "solve", lambda problem, z, weights, **more: SimpleNamespace(interrupted=False, converged=converged, z=np.ones(3), chi2=5.0)
+    )
+    given = problem([], 3), np.zeros(3), Choices(periods=(3,)), SimpleNamespace(problem=None, solution=SimpleNamespace(z=np.zeros(3)))
+    monkeypatch.setattr(module, "_density", lambda start: None)
+    ended = module._solved(lambda *_: (problem([], 8), np.zeros(3)), *given, np.inf, lambda *_: None, patient)
+    assert ended[2].periods == periods
+
+
 def test_a_rod_that_lags_by_more_than_a_period(monkeypatch):
     """4 ohm: after three periods M still moves at 300 Hz, and no density makes up for it."""
     bench, rng = load_bench("aa-050h"), np.random.default_rng(5)
