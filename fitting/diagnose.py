@@ -285,7 +285,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     if told is not None:
         other = None
         with contextlib.suppress(Late):
-            other = _plain_there(task.sparing, plain, told) if reached.steps else None
+            other = _plain_there(task.sparing, plain, told) if reached.steps and zero is None else None
         if other is not None:
             remembered = task.on(choices=dataclasses.replace(task.choices, rest=told.choices.rest))
             found = _examined(remembered, measured, adopted, check, other, before_zeros, zeros)

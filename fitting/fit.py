@@ -163,17 +163,24 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
 
     ended = [run(rests[0], (problem, z))(report)]
     if not settled(*ended[0][:2]) and not ended[0][1].interrupted:
-        try:
-            ended += together([run(rest) for rest in apart((*rests, *others), problem)[1:]], report)
-        except KeyboardInterrupt:
-            known, found, tried = ended[0]
-            ended = [(known, dataclasses.replace(found, converged=False, interrupted=True), tried)]
+        ended = _beside(ended[0], [run(rest) for rest in apart((*rests, *others), problem)[1:]], report)
     best = best_memory([row for row in ended if row[2].rest not in others or settled(*row[:2])])
-    if start is None and len(ended) > 1 and is_strained(*best[:2]) and not best[1].interrupted:
+    if start is None and len(ended) > 1 and is_strained(*best[:2]):
         again = [row[2].rest for row in ended if row[2].rest in rests and row[1].chi2 > best[1].chi2]
-        ended = [best, *together([_from_there(best, rest, actuator, bench, names, spectra) for rest in again], report)]
-        best = best_memory(ended)
+        best = best_memory(_beside(best, [_from_there(best, rest, actuator, bench, names, spectra) for rest in again], report))
     return best
+
+
+def _beside(first, runs, report):
+    """A fit, (problem, solution, choices), and those of the runs, side by side; after Ctrl-C the first alone, as one that was interrupted."""
+    try:
+        ended = [first, *together(runs, report)]
+    except KeyboardInterrupt:
+        ended = []
+    if ended and not any(solution.interrupted for _, solution, _ in ended):
+        return ended
+    problem, solution, choices = first
+    return [(problem, dataclasses.replace(solution, converged=False, interrupted=True), choices)]
 
 
 def _from_there(best, rest, actuator, bench, names, spectra):

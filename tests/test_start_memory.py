@@ -10,6 +10,7 @@ import pytest
 
 from fitting.density import hat_basis
 from fitting.fit import fit
+from fitting.joint import Solution
 from fitting.memories import best_memory
 from fitting.recipe import lag_recipe
 from fitting.setup import Choices
@@ -205,6 +206,18 @@ def test_another_start_memory_is_tried_from_where_a_strained_one_ended(monkeypat
     bench = SimpleNamespace(start="auto", drive="current")
     found = fit_module._start_memories(known, None, None, bench, (), Choices(), (), None, lambda *a: None, np.inf)
     assert found[2].rest == best and there == asked
+
+
+def test_an_interrupt_beside_a_strained_start_memory_keeps_what_was_reached(monkeypatch):
+    row = SimpleNamespace(), Solution(*[0.0] * 10, False), Choices(rest="demagnetized")
+
+    def stopped(say):
+        raise KeyboardInterrupt
+
+    for runs in ([stopped], [stopped, lambda say: row], [lambda say: (row[0], dataclasses.replace(row[1], interrupted=True), row[2])]):
+        ((_, solution, choices),) = fit_module._beside(row, runs, lambda *words: None)
+        assert solution.interrupted and not solution.converged and choices.rest == "demagnetized"
+    assert fit_module._beside(row, [lambda say: row], lambda *words: None) == [row, row]
 
 
 def of_memory(rest, chi2, strain=0.1):
