@@ -28,6 +28,7 @@ DOMINANT = (
     0.9,
     5.0,
 )  # share of a misfit from which an effect is named though it leaves some, if others leave so many times as much
+SHOWN = (0.3, 2.0)  # of the check recordings' misfit, that an effect may leave which is named for that, or so much a recording
 PROMISES = 8.0  # times the Newton decrement, that going on with a fit may gain at most
 DOMINANT_TEXT = " What is left is the form of its law, or something weaker beside it: no other effect takes nearly as much."
 LED_TEXT = " What is left is the form of their laws, or something weaker beside them: no other effect takes nearly as much as {}."
@@ -88,7 +89,8 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
     foretold = before > WELL_FORETOLD[0] * len(rows) and after < WELL_FORETOLD[1] * before
     full = FULL_SHARE if evidence.excess < CLEAN_CHI2 or foretold else FULLER_SHARE
-    alone = dominant(evidence)
+    # on check recordings, too, for a density bends to the wrong effect as to the right one
+    alone = dominant(evidence) and (after <= max(SHOWN[0] * before, SHOWN[1] * len(rows)) or as_expected(evidence))
     full, led = min(full, DOMINANT[0]) if alone else full, ""
     if evidence.missing and not rough and (not steps or evidence.share < full or evidence.excess > FAR_FROM_NOISE):
         first = first_alone(evidence)

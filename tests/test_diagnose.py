@@ -238,6 +238,28 @@ def test_a_verdict_after_the_time_is_over_claims_nothing_of_what_was_not_fitted(
     assert dominant(found) and not dominant(partial(found))
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "named"),
+    [((10.0, 8.0, 9.0), (1.5, 1.2, 1.4), True), ((10.3, 8.3, 9.1), (6.1, 7.8, 4.6), False), ((1.6, 1.0, 1.0), (1.5, 1.0, 1.0), True), ((), (), True)],
+    ids=["foretold", "not foretold", "nothing to foretell", "no checks"],
+)
+def test_what_leaves_far_less_than_all_others_must_show_in_the_check_recordings_too(monkeypatch, bench, before, after, named):
+    """A filter behind a field that diffuses, on cells, was called friction: 77 to 2.8, and its check recordings stayed at 5 to 8 of their noise."""
+    plain, alone = a_fit(77.0, 58.0), a_fit(2.8, 60.0, "creep")
+    step = trial("creep", alone, 7420.0)
+    others = {n: trial(n, a_fit(40.0, 60.0), 3700.0).candidate for n in ("creep", "backlash")}
+    rows = [{"file": f"c{k}", "unit": "m", "rms_before": b, "rms_after": a, "noise_rms": 1.0} for k, (b, a) in enumerate(zip(before, after, strict=True))]
+    monkeypatch.setattr("fitting.verdict.check_errors", lambda *a: rows)
+    monkeypatch.setattr("fitting.verdict.found_rows", lambda evidence: ([{"name": "creep", "block": "mechanics"}], [], {}, []))
+    monkeypatch.setattr("fitting.verdict.exchange", lambda *a: None)
+    evidence = dataclasses.replace(
+        evidence_of([(step, [step], [step], plain)], plain, alone, (scored("creep", 40.0),), others),
+        bench=bench, checks=(["check"] * len(rows), ()), where={"by_block": {"coil": 1.0}, "by_field": [1.0, 0.0]},
+    )  # fmt: skip
+    assert dominant(evidence)
+    assert verdict(evidence).verdict == ("attributed" if named else "unknown_at")
+
+
 def test_the_verdict_of_a_search_that_was_through_stands_where_the_fits_that_may_change_it_come_too_late(monkeypatch):
     plain, whole = a_fit(15.0, 58.0), a_fit(1.4, 60.0, "creep")
     step = trial("creep", whole, 1360.0)
