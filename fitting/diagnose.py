@@ -18,18 +18,15 @@ from .attribute import (
     FEEDBACKS,
     LIKE_DENSITY,
     MIN_DROP,
-    MISFIT,
-    chi2_of,
-    excess_of,
 )
 from .check import check_errors
 from .diagnosis import Diagnosis, Evidence, misfit
-from .finer import FINER_FROM, FINEST_BELOW, REFINE_BELOW, finer_hats, finest, hats_of_step
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
 from .learned import MANY, better_learned, with_learned_term
 from .locate import where
 from .memories import STATES
+from .missed_check import with_missed_check
 from .own_signals import (
     drifts_of_one,
     heat_on_harmonics,
@@ -41,35 +38,25 @@ from .own_signals import (
     unsettled_means,
     with_zero,
 )
-from .reach import BEYOND
+from .plain import better_valley, plain_there, screened_finer
 from .record_level import remove_from_checks
 from .rough import beside_cells, is_rough, on_better_density, on_cells_alone, without_chance, worth_a_search
 from .rows import DRIFTS, led_by_drifts
 from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
-from .spoilt import FAR, mended_by, spoilt
+from .spoilt import FAR, spoilt
 from .task import Clock, Late, Task
 from .told_memory import told_by_checks
-from .verdict import HALF, WORSE, Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
+from .verdict import WORSE, Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
 
 ABSORBED_VISIBILITY = 0.004
-UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
-VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
-COARSE = 0.5  # of a misfit, that a finer density may leave where the first one was too coarse
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
-MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
-GROSS = 0.1  # of its range, by which a check recording is missed that may be wrong itself
-EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
-UNSEEN_TEXT = "Check recordings are missed, times their noise: {}; about as the fit expects, for they switch cells that no recording did."
-ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
-FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
 LATE_TEXT = (
     "The limit of {:g} min (--minutes of magjax diagnose; in its last two fifths nothing is begun anew) left out what was still to be tried; "
     "with more time it may find more, or rivals to what it names."
 )
 MEMORY_TEXT = "The recordings of the fit do not tell their start memory; the check recordings do: {}."
-UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candidate would take half of the excess
 
 
 def diagnose(
@@ -101,7 +88,7 @@ def diagnose(
         within = functools.partial(diagnose, minutes=minutes)
         return diagnose_beyond(known, within, recordings, bench, check, actuator, choices, progress)
     task = Task(tuple(recordings), bench, choices, progress, actuator, Clock(minutes))
-    found = _with_asked(_with_missed_check(task, _diagnosed(task, check), check), choices.only)
+    found = _with_asked(with_missed_check(task, _diagnosed(task, check), check, _diagnosed), choices.only)
     return dataclasses.replace(found.noted(LATE_TEXT.format(minutes)), ended_after=minutes) if task.clock.cut else found
 
 
@@ -131,69 +118,6 @@ def _diagnosed(task, check) -> Diagnosis:
         return found
     names = " and ".join("the drift" if effect.name in DRIFTS else effect.name for effect, _ in adopted)
     return dataclasses.replace(found, message=f"{found.message} As recorded, before {names} was taken out: {problem}.")
-
-
-def _with_missed_check(task, found, check) -> Diagnosis:
-    """The diagnosis; where the fit meets its noise and misses a check recording by far, that one joins the recordings, if
-    others are left to check: what it shows they may not reach. What is named with it must foretell the others no worse.
-    """
-    known = found.verdict in ("attributed", "group", "nothing_missing") and not any(r.get("joined") for r in found.check)
-    if not known or not check or len(found.check) != len(check):
-        return found
-    if not (found.repaired or found.base).chi2_per_sample < MISFIT:
-        return found
-    ratios = [_surprise(r) for r in found.check]
-    if not max(ratios, default=0.0) > MISSED:
-        return _with_unseen_cells(found)
-    worst = int(np.argmax(ratios))
-    missed, left = check[worst], [c for k, c in enumerate(check) if k != worst]
-    name = missed.origin.get("file", missed.name).rsplit("/", 1)[-1]
-    if why := _contradiction(found, found.check[worst], missed, task.bench):
-        return found.noted(f"The check recording {name} contradicts the others: {why}; correct it or leave it out.")
-    told = f"{name} is missed by {ratios[worst]:.0f} times its noise, though the fit meets its own"
-    if not left:
-        return found.noted(f"{told}: the recordings do not reach what it shows; give it as one of them, and others to check.")
-    with contextlib.suppress(Late):
-        task.sparing.say(f"with {name} among the recordings")
-        again = _diagnosed(task.on(recordings=(*task.recordings, missed)), left)
-    if task.clock.cut:
-        return found.noted(f"{told}: there was no time to ask for what it shows beside the recordings.")
-    rest = [r for k, r in enumerate(found.check) if k != worst]
-    met = again.verdict in ("attributed", "group") and again.repaired.chi2_per_sample < MISFIT
-    before, after = misfit(rest, "rms_after"), misfit(again.check, "rms_after")
-    if not met or not _says_more(again, found) or after > WORSE[0] * before + WORSE[1] * len(rest):
-        return found.noted(f"{told}: the recordings do not reach what it shows, a density or physics; record more like it.")
-    row = {**found.check[worst], "rms_after": again.repaired.recordings[-1].residual_rms, "joined": True}
-    again = dataclasses.replace(again, check=(*again.check[:worst], row, *again.check[worst:]))
-    return again.noted(f"Without it among the recordings {told}; it joined them.")
-
-
-def _contradiction(found, row, recording, bench) -> str | None:
-    """What is wrong with a check recording that is missed grossly, in words; None where no one number mends it."""
-    if not row["rms_after"] > GROSS * np.ptp(recording.channels[bench.output]):
-        return None
-    return mended_by((found.repaired or found.base).actuator, recording, bench)
-
-
-def _with_unseen_cells(found) -> Diagnosis:
-    """The diagnosis with a word on check recordings within the plane that are missed by far, as the fit expects."""
-    within = [r for r in found.check if r["noise_rms"] and r["beyond_plane"] <= BEYOND]
-    rows = [(r["file"].rsplit("/", 1)[-1], r["rms_after"] / r["noise_rms"]) for r in within]
-    far = [f"{name} by {ratio:.0f}" for name, ratio in rows if ratio > MISSED]
-    return found.noted(UNSEEN_TEXT.format(", ".join(far))) if far else found
-
-
-def _surprise(row) -> float:
-    """How many times its noise a check recording is missed by; 0 where the fit expected as much, or its drive leaves the plane."""
-    if not row["noise_rms"] or row["beyond_plane"] > BEYOND or row["rms_after"] < EXPECTED * (row.get("expected_rms") or 0.0):
-        return 0.0
-    return row["rms_after"] / row["noise_rms"]
-
-
-def _says_more(again, found) -> bool:
-    """Whether a diagnosis names more, or the same with fewer doubts."""
-    number, before = (len(d.effects) + len(d.groups) for d in (again, found))
-    return number > before or (number == before and len(again.groups) < len(found.groups))
 
 
 def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zeros: bool = True) -> Diagnosis:
@@ -246,7 +170,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
         return _examined(cleaned, measured, [*adopted, own], check, freed, (task, adopted))
     free = task.held if zero is None else (*task.held, "sensor.offset")
     checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
-    plain, candidates = _screened_finer(task, plain, candidates, free)
+    plain, candidates = screened_finer(task, plain, candidates, free)
     raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
     place = where(plain, candidates, task.recordings, task.bench.output)
     anew = []  # what the diagnosis begins anew with: recordings without what showed beside an effect, or a better plain fit
@@ -259,7 +183,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
             elif found := heat_on_harmonics(task.sparing, adopted, current):
                 cleaned, heat, _ = found
                 anew.append({"task": task.on(recordings=cleaned.recordings), "adopted": heat})
-            elif zero is None and (better := _better_valley(task.sparing, plain, candidates, current)):
+            elif zero is None and (better := better_valley(task.sparing, plain, candidates, current)):
                 anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
         return bool(anew)
 
@@ -285,7 +209,7 @@ def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Di
     if told is not None:
         other = None
         with contextlib.suppress(Late):
-            other = _plain_there(task.sparing, plain, told) if reached.steps and zero is None else None
+            other = plain_there(task.sparing, plain, told) if reached.steps and zero is None else None
         if other is not None:
             remembered = task.on(choices=dataclasses.replace(task.choices, rest=told.choices.rest))
             found = _examined(remembered, measured, adopted, check, other, before_zeros, zeros)
@@ -358,90 +282,6 @@ def _absorbed(candidates, tried) -> tuple[str, ...]:
     shown = {name for name, c in tried.items() if (c.achieved_chi2_drop or 0.0) > MIN_DROP}
     silent = [c for c in candidates if abs(c.z) < Z_THRESHOLD and c.name not in shown]
     return tuple(c.name for c in silent if c.visibility < ABSORBED_VISIBILITY or c.name in (*LIKE_DENSITY, *FEEDBACKS))
-
-
-def _better_valley(task, plain, candidates, current):
-    """The plain fit from where that with effects ended, if it falls far: it had settled in a valley of its density, and an effect
-    was credited with the way out. Asked where the effects take far more than any promised to first order. None elsewhere.
-    """
-    drop = chi2_of(plain) - chi2_of(current)
-    if drop < UNPROMISED * max(c.z**2 for c in candidates):
-        return None
-    task.say("the plain model from there", current.chi2_per_sample)
-    better = task.fit_on(current, _without_found(current, plain), choices=current.choices)
-    return better if chi2_of(better) < chi2_of(plain) - max(MIN_DROP, VALLEY * drop) else None
-
-
-def _plain_there(task, plain, told):
-    """The plain fit from the start memory that check recordings told beside effects, where it leaves less than from its own: then these
-    may have made up for that. None elsewhere."""
-    task.say("the plain model from that start memory", told.chi2_per_sample)
-    other = task.fit_on(plain, _without_found(told, plain), choices=dataclasses.replace(plain.choices, rest=told.choices.rest))
-    return other if chi2_of(other) < chi2_of(plain) - MIN_DROP else None
-
-
-def _without_found(found, plain):
-    """The actuator of a fit without the effects that the plain one has not."""
-    held = {e.name for e in plain.actuator.effects}
-    return functools.reduce(lambda a, e: a if e.name in held else a.without_effect(e.name), found.actuator.effects, found.actuator)
-
-
-def _screened_finer(task, base, candidates, free):
-    """The base and its candidates; where none would take half of what is left, a finer density is given a chance first.
-
-    What a density rougher than its hats leaves scores as effects do (up to 20 on nulls), but on the finest hats (up to 4.3): there
-    they are asked for again.
-    """
-    if base.choices.knots is None or _leader_takes(base, candidates) > HALF:
-        return base, candidates
-    if base.chi2_per_sample > REFINE_BELOW:
-        finer = _on_finer_hats(task, base, free)
-        candidates = candidates if finer is base else screened(finer, task.choices)
-        base = finer
-    last = hats_of_step(base.choices, task.bench, 2)
-    rough = last and base.choices.knots != task.choices.knots and FINER_FROM[1] < base.chi2_per_sample < UNEXPLAINED
-    if rough and _leader_takes(base, candidates) < HALF:
-        finer = task.fit_on(base, base.actuator, extra=free, choices=last[0])
-        if finer.chi2_per_sample < REFINE_BELOW and excess_of(finer, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
-            return finer, screened(finer, task.choices)
-    return base, candidates
-
-
-def _on_finer_hats(task, base, free):
-    """The fit on a finer density, if one takes its share of what the base leaves."""
-    finer, late = base, False
-    if base.chi2_per_sample > UNEXPLAINED:  # physics, most likely: unless finer hats take most of it
-        for late in (False, True):
-            for choices in hats_of_step(base.choices, task.bench, int(late)):
-                finer = task.fit_on(base, base.actuator, extra=free, choices=choices)
-            if excess_of(finer, 1.0) < COARSE * excess_of(base, 1.0):
-                break
-        else:
-            return base
-    finer = task.fit_on(finer, base.actuator, extra=free, choices=finer.choices, refine=UNEXPLAINED)
-    last = _on_last_hats(task, finer, free) if finer.chi2_per_sample > UNEXPLAINED else finer
-    highest = FINEST_BELOW if excess_of(last, 1.0) < ALL_BUT * excess_of(base, 1.0) else REFINE_BELOW
-    if finest(last.choices) and last.chi2_per_sample < highest:
-        return last
-    if late and finer.chi2_per_sample > REFINE_BELOW:  # so fine a density bends to physics, too
-        return base
-    return base if finer.choices == base.choices else finer
-
-
-def _on_last_hats(task, base, free):
-    """The fit on finer and finer hats, as long as each takes half of what those before leave."""
-    while choices := finer_hats(base.choices):
-        finer = task.fit_on(base, base.actuator, extra=free, choices=choices[0])
-        if not excess_of(finer, 1.0) < COARSE * excess_of(base, 1.0):
-            break
-        base = finer
-    return base
-
-
-def _leader_takes(base, candidates) -> float:
-    """Of what a fit leaves, the most that an effect promises which no density passes for."""
-    best = max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)
-    return best / max(excess_of(base, 1.0), MIN_DROP)
 
 
 def _floors(result) -> dict:

@@ -1051,7 +1051,7 @@ def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch
 
 def test_a_plain_fit_that_settled_in_a_valley_is_begun_anew_from_where_effects_led():
     """An effect that takes far more than any promised to first order was credited with the way out of it."""
-    from fitting.diagnose import _better_valley
+    from fitting.plain import better_valley
     from magjax.bench import load_bench
     from magjax.effects import Creep
 
@@ -1065,11 +1065,11 @@ def test_a_plain_fit_that_settled_in_a_valley_is_begun_anew_from_where_effects_l
             asked.append((start, actuator.effects))
             return SimpleNamespace(chi2_per_sample=self.recordings[0], data_count=COUNT)
 
-    found = _better_valley(Told((1.3,), None), plain, [candidate("creep", 9.0)], moved)
+    found = better_valley(Told((1.3,), None), plain, [candidate("creep", 9.0)], moved)
     assert found.chi2_per_sample == 1.3 and asked == [(moved, ())]
     # a fit that falls little was at its best, and one effect that kept its promise is not asked about
-    assert _better_valley(Told((4.0,), None), plain, [candidate("creep", 9.0)], moved) is None and len(asked) == 2
-    assert _better_valley(Told((1.3,), None), plain, [candidate("creep", 40.0)], moved) is None and len(asked) == 2
+    assert better_valley(Told((4.0,), None), plain, [candidate("creep", 9.0)], moved) is None and len(asked) == 2
+    assert better_valley(Told((1.3,), None), plain, [candidate("creep", 40.0)], moved) is None and len(asked) == 2
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Check recordings: predictions, and a word where their drive leaves the plane that was fitted."""
 
 import dataclasses
-import importlib
 import json
 from types import SimpleNamespace
 
@@ -12,6 +11,7 @@ from fitting.check import all_lines, beyond_plane, check_errors, predictions
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.diagnosis import Diagnosis
+from fitting.missed_check import with_missed_check
 from fitting.reach import beyond_text
 from fitting.report.tables import checks
 from fitting.setup import Choices
@@ -22,8 +22,6 @@ from magjax.effects import AmplifierClipping
 from magjax.errors import ConfigurationError
 from magjax.recording import Recording
 from magjax.simulate import simulate
-
-module = importlib.import_module("fitting.diagnose")  # not the function
 
 
 def recording(amplitude, name, periods=3, n=200):
@@ -114,16 +112,15 @@ CUT = "a search that was ended"
 
 def with_missed(monkeypatch, found, again, check=CHECKS, clock=None):
     asked, clock = [], clock or Clock()
-    monkeypatch.setattr(module, "_contradiction", lambda *a: None)
+    monkeypatch.setattr("fitting.missed_check._contradiction", lambda *a: None)
 
     def diagnosed(task, left):
         asked.append(([r.name for r in task.recordings], [c.name for c in left]))
         clock.cut = again is CUT
         return missed(1, 1.5, effects=BOTH) if again is CUT else again
 
-    monkeypatch.setattr(module, "_diagnosed", diagnosed)
     task = Task((recording(0.8, "fit.csv"),), load_bench("aa-050h"), Choices(), clock=clock)
-    return module._with_missed_check(task, found, check), asked
+    return with_missed_check(task, found, check, diagnosed), asked
 
 
 def test_a_check_missed_by_far_joins_the_recordings_where_more_is_named_with_it(monkeypatch):

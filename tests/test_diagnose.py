@@ -34,6 +34,7 @@ from magjax.effects import CATALOGUE, SensorLag
 from magjax.recording import Recording
 
 module = importlib.import_module("fitting.diagnose")  # not the function
+plain_module = importlib.import_module("fitting.plain")
 
 DRIVES = ((10, 0.8, 0.1), (50, 0.5, -0.2), (120, 0.8, 0.1), (200, 0.5, -0.2), (300, 0.8, 0.1))
 
@@ -97,7 +98,7 @@ def test_effects_are_asked_for_again_where_the_plain_model_serves_better_from_th
         return fitted(1.2 - fall / 700, actuator, choices.rest)
 
     monkeypatch.setattr(Task, "fit_on", fit_on)
-    found = module._plain_there(Task((), bench), plain, told)
+    found = plain_module.plain_there(Task((), bench), plain, told)
     assert asked == [(True, (), "negative", (24, 18))] and (found is not None) is (fall > 25)
 
 
@@ -450,8 +451,8 @@ def test_effects_are_asked_for_on_the_finest_hats_where_a_rough_density_hides_th
 
     steps, base = [], fitted(*plain)
     monkeypatch.setattr(Task, "fit_on", fit_on)
-    monkeypatch.setattr(module, "screened", lambda fit, choices: [scored("creep", 5.0)])
-    found, candidates = module._screened_finer(Task((), bench), base, [scored("creep", score), scored("mean_field", 900.0)], ())
+    monkeypatch.setattr(plain_module, "screened", lambda fit, choices: [scored("creep", 5.0)])
+    found, candidates = plain_module.screened_finer(Task((), bench), base, [scored("creep", score), scored("mean_field", 900.0)], ())
     assert found.choices.knots == hats[taken] and steps == asked
     assert (found is base) == (candidates[0].z == score)
 

@@ -9,6 +9,7 @@ import pytest
 from fitting.demo import concealed_actuator, record
 from fitting.diagnosis import Diagnosis
 from fitting.fit import fit
+from fitting.missed_check import with_missed_check
 from fitting.setup import Choices
 from fitting.spoilt import Spoilt, mended_by, odd_one, spoilt
 from fitting.task import Task
@@ -143,7 +144,7 @@ def test_a_check_recording_that_contradicts_is_named(monkeypatch):
     rows = ({"file": "80 Hz", "rms_before": 5e-5, "rms_after": 5e-5, "noise_rms": 5e-8, "beyond_plane": 0.0},)
     found = Diagnosis("nothing_missing", "All is well.", base=fitted, check=rows)
     swapped = changed(row, reading=lambda y: -y)
-    again = module._with_missed_check(Task((row,), BENCH), found, [swapped])
+    again = with_missed_check(Task((row,), BENCH), found, [swapped], None)
     assert "The check recording 80 Hz contradicts the others" in again.message and "swapped" in again.message
 
 
@@ -152,6 +153,6 @@ def test_a_check_recording_that_is_missed_by_little_is_not_said_to_be_wrong(monk
     row = record(TRUTH, 80, 0.5, 0.05, np.random.default_rng(3), "80 Hz")
     fitted = dataclasses.make_dataclass("Fitted", ["actuator", "chi2_per_sample"])(TRUTH, 0.9)
     rows = ({"file": "80 Hz", "rms_before": 5e-7, "rms_after": 5e-7, "noise_rms": 5e-8, "beyond_plane": 0.0},)
-    monkeypatch.setattr(module, "mended_by", lambda *a: "its reading is 1.02 times what they make of it")
-    found = module._with_missed_check(Task((row,), BENCH), Diagnosis("nothing_missing", "All is well.", base=fitted, check=rows), [row])
+    monkeypatch.setattr("fitting.missed_check.mended_by", lambda *a: "its reading is 1.02 times what they make of it")
+    found = with_missed_check(Task((row,), BENCH), Diagnosis("nothing_missing", "All is well.", base=fitted, check=rows), [row], None)
     assert "contradicts" not in found.message and "80 Hz is missed by 10 times its noise" in found.message
