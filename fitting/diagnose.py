@@ -14,11 +14,8 @@ from magjax.bench import load_bench
 from magjax.effects import CLASSES
 
 from .alternation import alternating
-from .attribute import (
-    FEEDBACKS,
-    LIKE_DENSITY,
-    MIN_DROP,
-)
+from .attribute import FEEDBACKS, LIKE_DENSITY, MIN_DROP
+from .beginning import Anew, Beginning
 from .check import check_errors
 from .diagnosis import Diagnosis, Evidence, misfit
 from .floors import data_problem, solver_floor, wrong_bench
@@ -29,16 +26,12 @@ from .memories import STATES
 from .missed_check import with_missed_check
 from .own_signals import (
     drifts_of_one,
-    heat_on_harmonics,
-    hum_on_harmonics,
     needless_zeros,
-    own_zeros,
     record_level,
     sensor_zero,
-    unsettled_means,
     with_zero,
 )
-from .plain import better_valley, plain_there, screened_finer
+from .plain import plain_there, screened_finer
 from .record_level import remove_from_checks
 from .rough import beside_cells, is_rough, on_better_density, on_cells_alone, without_chance, worth_a_search
 from .rows import DRIFTS, led_by_drifts
@@ -112,7 +105,7 @@ def _diagnosed(task, check) -> Diagnosis:
     adopted, cleaned = record_level(recordings, spectra, bench, choices)
     if problem and (not adopted or data_problem(cleaned, spectra_of(cleaned, bench, choices.harmonics), bench.output)):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=task.fit(refine=False))
-    found = _examined(task.on(recordings=tuple(cleaned)), task, adopted, check)
+    found = _examined(Beginning(task.on(recordings=tuple(cleaned)), task, tuple(adopted), check))
     found = functools.reduce(Diagnosis.noted, drifting, found)
     if not problem:
         return found
@@ -120,19 +113,17 @@ def _diagnosed(task, check) -> Diagnosis:
     return dataclasses.replace(found, message=f"{found.message} As recorded, before {names} was taken out: {problem}.")
 
 
-def _examined(task, measured, adopted, check, plain=None, before_zeros=None, zeros: bool = True) -> Diagnosis:
-    """The diagnosis of recordings without the record-level effects `adopted`; `measured`: the task with them as they came,
-    `plain`: a fit of theirs, where it is known; `before_zeros`: task and adopted before zeros of the recordings were; `zeros`:
-    whether these may be."""
-    first, plain = plain is None, task.fit() if plain is None else plain
+def _examined(begun: Beginning) -> Diagnosis:
+    """The diagnosis of recordings without record-level effects."""
+    first, plain = begun.plain is None, begun.task.fit() if begun.plain is None else begun.plain
     try:
         far = plain.chi2_per_sample > FAR
-        suspect = _spoilt(task, plain) if first and far else None
+        suspect = _spoilt(begun.task, plain) if first and far else None
         if suspect is None or not suspect.certain:
-            found = _explained(task, measured, adopted, check, plain, before_zeros, zeros)
+            found = _explained(begun.on(plain=plain))
             if not first or found.verdict != "unknown_at":
                 return found
-            suspect = suspect if far else _spoilt(task, plain)
+            suspect = suspect if far else _spoilt(begun.task, plain)
         if suspect is None:
             return found
         if suspect.certain:
@@ -153,74 +144,64 @@ def _spoilt(task, plain):
     return None
 
 
-def _explained(task, measured, adopted, check, plain, before_zeros, zeros) -> Diagnosis:
-    """The diagnosis from the plain fit on; arguments as those of `_examined`."""
+def _explained(begun: Beginning) -> Diagnosis:
+    """The diagnosis from the plain fit on."""
+    task, plain = begun.task, begun.plain
     if problem := wrong_bench(plain):
         return Diagnosis("data_problem", problem + ".", data_problem=problem, base=plain)
     candidates = screened(plain, task.choices)
-    if found := hum_on_harmonics(task, adopted, plain, candidates):
-        cleaned, hum, freed = found
-        return _examined(cleaned, measured, [*adopted, hum], check, freed)
-    if found := heat_on_harmonics(task, adopted, plain):
-        cleaned, heat, freed = found
-        return _examined(cleaned, measured, heat, check, freed)
+    if cleaned := begun.from_plain(plain, candidates):
+        return _examined(cleaned)
     plain, candidates, zero, rival = sensor_zero(task, plain, candidates)
-    if zeros and zero is None and (found := own_zeros(task, adopted, plain, candidates)):
-        cleaned, own, freed = found
-        return _examined(cleaned, measured, [*adopted, own], check, freed, (task, adopted))
+    if zero is None and (freed := begun.with_own_means(plain, candidates)):
+        return _examined(freed)
     free = task.held if zero is None else (*task.held, "sensor.offset")
-    checks = check, remove_from_checks(check, [e for e, _ in adopted], task.bench)
     plain, candidates = screened_finer(task, plain, candidates, free)
-    raw = measured.fit(extra=free, choices=plain.choices, refine=False) if adopted else plain
+    begun = begun.on(plain=plain)
+    raw = begun.measured.fit(extra=free, choices=plain.choices, refine=False) if begun.adopted else plain
     place = where(plain, candidates, task.recordings, task.bench.output)
-    anew = []  # what the diagnosis begins anew with: recordings without what showed beside an effect, or a better plain fit
-
-    def begins_anew(current) -> bool:
-        with contextlib.suppress(Late):
-            if found := hum_on_harmonics(task.sparing, adopted, current):
-                cleaned, hum, _ = found
-                anew.append({"task": task.on(recordings=cleaned.recordings), "adopted": [*adopted, hum]})
-            elif found := heat_on_harmonics(task.sparing, adopted, current):
-                cleaned, heat, _ = found
-                anew.append({"task": task.on(recordings=cleaned.recordings), "adopted": heat})
-            elif zero is None and (better := better_valley(task.sparing, plain, candidates, current)):
-                anew.append({"task": task, "adopted": adopted, "plain": better, "before_zeros": before_zeros})
-        return bool(anew)
-
-    def free_means(fit, best, beside=()) -> bool:
-        with contextlib.suppress(Late):
-            if zeros and zero is None and (found := unsettled_means(task.sparing, adopted, fit, best, beside)):
-                cleaned, own = found
-                freed = task.on(recordings=cleaned.recordings)
-                anew.append({"task": freed, "adopted": [*adopted, own], "before_zeros": (task, adopted)})
-        return bool(anew)
-
-    reached = search(task.timed, plain, worth_a_search(plain, candidates), checks[1], begins_anew, free_means)
-    if anew:
-        return _examined(measured=measured, check=check, zeros=zeros, **anew[-1])
-    needless = False
-    with contextlib.suppress(Late):
-        needless = before_zeros and needless_zeros(before_zeros[0].sparing, reached)
-    if needless:
-        return _examined(before_zeros[0], measured, before_zeros[1], check, zeros=False)
+    checks = begun.check, remove_from_checks(begun.check, [e for e, _ in begun.adopted], task.bench)
+    anew = Anew(begun, candidates, zero is not None)
+    reached = search(task.timed, plain, worth_a_search(plain, candidates), checks[1], anew, anew.means)
+    if anew.found:
+        return _examined(anew.found)
+    if before := _with_needed_means(begun, reached):
+        return _examined(before)
     told = None
     with contextlib.suppress(Late):
         told = told_by_checks(task.sparing, reached.current, reached.foretell)
     if told is not None:
-        other = None
-        with contextlib.suppress(Late):
-            other = plain_there(task.sparing, plain, told) if reached.steps and zero is None else None
-        if other is not None:
-            remembered = task.on(choices=dataclasses.replace(task.choices, rest=told.choices.rest))
-            found = _examined(remembered, measured, adopted, check, other, before_zeros, zeros)
-            return found.noted(MEMORY_TEXT.format(STATES[told.choices.rest]))
-        plain, raw = (plain, raw) if reached.steps else (told, raw if adopted else told)
+        if remembered := _remembered(begun, told) if reached.steps and zero is None else None:
+            return _with_memory(_examined(remembered), told)
+        plain, raw = (plain, raw) if reached.steps else (told, raw if begun.adopted else told)
         reached = dataclasses.replace(reached, current=told)
     evidence = Evidence(
-        reached, tuple(adopted), raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
+        reached, begun.adopted, raw, plain, tuple(candidates), task.recordings, task.bench, checks, _floors(plain), place,
         _absorbed(candidates, reached.tried), task.choices.only,
     )  # fmt: skip
-    found = with_zero(_concluded(task, led_by_drifts(evidence)), zero, rival)
+    return _with_memory(with_zero(_concluded(task, led_by_drifts(evidence)), zero, rival), told)
+
+
+def _with_needed_means(begun, reached) -> Beginning | None:
+    """From before means of the recordings were set free, where what was found does not need that; None elsewhere."""
+    before = begun.before_means
+    with contextlib.suppress(Late):
+        if before and needless_zeros(before.task.sparing, reached):
+            return before.on(plain=None, means=False)
+    return None
+
+
+def _remembered(begun, told) -> Beginning | None:
+    """From the start memory that check recordings told, where the plain fit leaves less from there; None elsewhere."""
+    task = begun.task
+    with contextlib.suppress(Late):
+        if other := plain_there(task.sparing, begun.plain, told):
+            return begun.on(task=task.on(choices=dataclasses.replace(task.choices, rest=told.choices.rest)), plain=other)
+    return None
+
+
+def _with_memory(found, told) -> Diagnosis:
+    """The diagnosis with a word on the start memory that check recordings told, if they did."""
     return found if told is None else found.noted(MEMORY_TEXT.format(STATES[told.choices.rest]))
 
 

@@ -94,10 +94,10 @@ def test_a_large_drift_of_every_record_is_named_and_that_of_one_spoils_it(monkey
     runs = [moved[k] if k in drifting else plain[k] for k in range(4)]
     monkeypatch.setattr(module.Task, "fit", lambda self, *a, **k: None)
 
-    def examined(task, measured, adopted, check):
-        left = [np.ptp(r.channels["displacement"][::500]) for r in task.recordings]  # one sample a period
+    def examined(begun):
+        left = [np.ptp(r.channels["displacement"][::500]) for r in begun.task.recordings]  # one sample a period
         assert max(left) < 1e-6
-        return Diagnosis("attributed", f"{adopted[0][0].name} was left out.")
+        return Diagnosis("attributed", f"{begun.adopted[0][0].name} was left out.")
 
     monkeypatch.setattr(module, "_examined", examined)
     found = module.diagnose(runs, BENCH)

@@ -6,6 +6,7 @@ import importlib
 import numpy as np
 import pytest
 
+from fitting.beginning import Beginning
 from fitting.demo import concealed_actuator, record
 from fitting.diagnosis import Diagnosis
 from fitting.fit import fit
@@ -129,13 +130,13 @@ def test_a_spoilt_recording_ends_the_diagnosis_before_any_search(monkeypatch):
         searched.clear()
         task = Task(tuple(recorded(DRIVES[:1])), BENCH, Choices())
         monkeypatch.setattr(Task, "fit", lambda self, chi2=chi2: base(chi2))
-        found = module._examined(task, task, [], [])
+        found = module._examined(Beginning(task, task, (), []))
         assert found.verdict == "data_problem" and found.message == "it is wrong." and len(searched) == times
     monkeypatch.setattr(module, "spoilt", lambda task, plain: Spoilt("look at it", False))
-    found = module._examined(task, task, [], [])
+    found = module._examined(Beginning(task, task, (), []))
     assert found.verdict == "unknown_at" and found.message.endswith("look at it.")
     monkeypatch.setattr(module, "wrong_bench", lambda plain: "a sign is swapped")  # which is told by itself
-    assert module._examined(task, task, [], []).message == "Something is missing."
+    assert module._examined(Beginning(task, task, (), [])).message == "Something is missing."
 
 
 def test_a_check_recording_that_contradicts_is_named(monkeypatch):
