@@ -16,11 +16,10 @@ from magjax.effects import CLASSES
 from .alternation import alternating
 from .attribute import FEEDBACKS, LIKE_DENSITY, MIN_DROP
 from .beginning import Anew, Beginning
-from .check import check_errors
-from .diagnosis import Diagnosis, Evidence, misfit
+from .diagnosis import Diagnosis, Evidence
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
-from .learned import MANY, better_learned, with_learned_term
+from .learned import LEAVES_MISFIT, MANY, better_learned, with_learned_term
 from .locate import where
 from .memories import STATES
 from .missed_check import with_missed_check
@@ -41,10 +40,9 @@ from .setup import Choices, spectra_of, with_held_masses
 from .spoilt import FAR, spoilt
 from .task import Clock, Late, Task
 from .told_memory import told_by_checks
-from .verdict import WORSE, Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
+from .verdict import Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
 
 ABSORBED_VISIBILITY = 0.004
-LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 LATE_TEXT = (
     "The limit of {:g} min (--minutes of magjax diagnose; in its last two fifths nothing is begun anew) left out what was still to be tried; "
     "with more time it may find more, or rivals to what it names."
@@ -239,8 +237,8 @@ def _thorough(task, evidence, found) -> Diagnosis:
 
 
 def _wrong_name(task, evidence, found):
-    """A learned term that serves far better than the effects that were named, in another block, and foretells the check recordings
-    no worse, where these leave a misfit, or one that serves as well as `MANY`; None elsewhere."""
+    """A learned term that serves better than the effects that were named, in another block, where these leave a misfit, or one that
+    serves as well as `MANY`; None elsewhere."""
     alone = evidence if len(evidence.reached.steps) == 1 else first_alone(evidence)
     named = alone if alone is not None and found.repaired is alone.reached.current else evidence
     steps, current = named.reached.steps, named.reached.current
@@ -249,12 +247,8 @@ def _wrong_name(task, evidence, found):
     if not found.repaired.chi2_per_sample > LEAVES_MISFIT and len(steps) < MANY:
         return None
     blocks = {t.candidate.block for _, rivals, *_ in steps for t in rivals}
-    learned = better_learned(evidence.plain, current, blocks, evidence.recordings, evidence.bench, len(steps), task.progress)
-    if learned is None:
-        return None
-    rows = check_errors(current.actuator, learned.result.actuator, evidence.checks[1], evidence.bench)
-    before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
-    return None if after > WORSE[0] * before + WORSE[1] * len(rows) else learned
+    about = evidence.recordings, evidence.bench, len(steps), evidence.checks[1], task.progress
+    return better_learned(evidence.plain, current, blocks, *about)
 
 
 def _absorbed(candidates, tried) -> tuple[str, ...]:

@@ -16,13 +16,15 @@ from magjax.simulate import run_chain
 
 from .attribute import AT_NOISE
 from .check import check_errors, foretold_text
+from .diagnosis import misfit
+from .finer import FINER_FROM, REFINE_BESIDE, finer_hats
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .nonparametric import ONE, Place, locate_places
 from .setup import build_problem
 from .together import let_go
 from .uncertainty import WIDEN, covariance
-from .verdict import asked_for
+from .verdict import WORSE, asked_for
 
 TRIED = 4  # leaders that are fitted jointly
 NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
@@ -31,7 +33,10 @@ CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned function leaves where the effect is the wrong name
 MANY = 3  # effects in place of which a function that leaves no more is the better word: so many at once are seldom missing
+LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
+AS_MUCH, FORETOLD = 1.1, 0.5  # of the chi2 of effects on finer hats, and of what they miss check recordings by, that one may leave
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
+COARSE = 0.5  # of what a term leaves above the noise, that finer hats beside it may leave
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 BASE_LOSSES = {  # of the base, that act as a constant times a rate
     ("coil", "flux_rate"): ("coil.R_eddy", "coil.k_eddy", "effects.eddy_currents.k"),
@@ -89,18 +94,20 @@ def left_out(problem, solution) -> np.ndarray:
     return np.asarray(rows)
 
 
-def fit_term(base, place: Place, recordings, bench, progress=None, target: float = np.inf) -> Learned:
+def fit_term(base, place: Place, recordings, bench, progress=None, target: float = np.inf, choices=None) -> Learned:
     """Fit a place's term jointly with density, parameters and adopted effects of a `FitResult`; `target`: a chi2 above which it is of
-    no use, and foretells nothing."""
+    no use, and foretells nothing; `choices`: of another density than the fit's."""
     say = progress or (lambda *a: None)
+    basis, choices = base.problem.basis, choices or base.choices
     n = base.problem.layout.density_unknowns
     names = (*base.problem.layout.names, *(f"effects.learned_term.{c}" for c in place.term.parameters()))
     term, start, weights, z = place.term, base.solution.z, base.solution.weights, None
     before = base.chi2_per_sample * base.data_count
-    choices = dataclasses.replace(base.choices, coarse=base.choices.fine) if max(term.counts) > ONE else base.choices
+    choices = dataclasses.replace(choices, coarse=choices.fine) if max(term.counts) > ONE else choices
     for again in range(2):
         actuator = base.actuator.with_effect(term)
-        problem, z = build_problem(base.spectra, actuator, bench, names, choices, (base.problem.basis, start[: n + 1]))
+        problem, z = build_problem(base.spectra, actuator, bench, names, choices, (basis, start[: n + 1]))
+        n, basis = problem.layout.density_unknowns, problem.basis
         z[len(z) - problem.layout.memories :] = start[len(start) - problem.layout.memories :]
         if again:
             z[n + 1 : n + 1 + len(names)] = moved  # noqa: F821
@@ -157,6 +164,14 @@ def chosen_places(places) -> list[Place]:
     return chosen[:TRIED]
 
 
+def other_places(places, tried) -> list[Place]:
+    """Of each block without a simple place among those `tried`, its best one, where its evidence comes some way."""
+    simple = [p for p in places if p.simple and p.evidence > SOME_WAY * places[0].evidence]
+    had = {p.block for p in tried if p.simple}
+    first = {p.block: p for p in reversed(simple)}  # the best of each comes last
+    return sorted((p for block, p in first.items() if block not in had), key=lambda p: -p.evidence)[:TRIED]
+
+
 def _needless(place, tried) -> bool:
     """Whether one of those tried meets the noise and is as simple and far ahead to first order, or is simple in the same block."""
     met = [t for t in tried if t.result.chi2_per_sample < MET]
@@ -165,26 +180,49 @@ def _needless(place, tried) -> bool:
 
 
 def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Learned | None:
-    """The term that serves best beside a fit, or None where none foretells left-out recordings better, or comes below the `target`."""
+    """The term that serves best beside a fit, or None where none foretells left-out recordings better, or comes below the `target`.
+
+    Far from the noise the evidence is no more than a hint: where none of its leaders serves and there is no target, simple ones of the
+    other blocks are tried, too, and the density may be finer beside the term.
+    """
     say = progress or (lambda *a: None)
     let_go()
     places = [p for p in locate_places(base, say) if p.evidence > 0]
     if not places:
         return None
     tried = []
-    for place in chosen_places(places):
-        if not _needless(place, tried):
-            let_go()
-            tried.append(fit_term(base, place, recordings, bench, progress, target))
-    tried = sorted((t for t in tried if np.isfinite(t.result.chi2_per_sample)), key=lambda t: t.left_out[1])
-    if not tried or not tried[0].worth:
+
+    def try_all(chosen):
+        for place in chosen:
+            if not _needless(place, tried):
+                let_go()
+                tried.append(fit_term(base, place, recordings, bench, progress, target))
+        tried.sort(key=lambda t: np.nan_to_num(t.left_out[1], nan=np.inf))
+        return any(t.worth for t in tried)
+
+    if not try_all(chosen_places(places)) and not (target == np.inf and try_all(other_places(places, [t.place for t in tried]))):
         return None
+    tried = [t for t in tried if np.isfinite(t.result.chi2_per_sample)]
     near = 1 + 1.3 * (tried[0].left_out[1] - 1) + 0.1
     # of those that serve as well, the one that the rest of the model hides least: another must be larger to be seen as much
     best, *others = sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: -t.place.visibility)
     rivals = tuple(t.place for t in others)
-    fits = tuple((t.place, float(t.result.chi2_per_sample), float(t.left_out[1]) if np.isfinite(t.left_out[1]) else None) for t in tried)
+    fits = tuple(
+        (t.place, float(t.result.chi2_per_sample), float(t.left_out[1]) if np.isfinite(t.left_out[1]) else None) for t in tried
+    )
+    best = best if target < np.inf else _on_finer_hats(best, base, recordings, bench, progress)
     return dataclasses.replace(best, places=tuple(places), rivals=rivals, tried=fits)
+
+
+def _on_finer_hats(learned, base, recordings, bench, progress) -> Learned:
+    """The same term beside finer and finer hats, as long as each takes half of what those before leave: the density was chosen
+    without it. What it foretells of recordings left out is that of the first: finer cells are seen by one recording alone."""
+    while FINER_FROM[0] < learned.result.chi2_per_sample < REFINE_BESIDE and (choices := finer_hats(learned.result.choices)):
+        finer = fit_term(base, learned.place, recordings, bench, progress, choices=choices[0])
+        if not finer.result.chi2_per_sample - 1 < COARSE * (learned.result.chi2_per_sample - 1):
+            break
+        learned = dataclasses.replace(finer, left_out=learned.left_out)
+    return learned
 
 
 def band(learned: Learned, *values):
@@ -310,19 +348,28 @@ def described(learned: Learned) -> dict:
     }  # fmt: skip
 
 
-def better_learned(base, named, blocks, recordings, bench, number: int = 1, progress=None) -> Learned | None:
+def better_learned(base, named, blocks, recordings, bench, number: int = 1, check=(), progress=None) -> Learned | None:
     """A term that shows effects to be the wrong names: in another block than `blocks`, it leaves next to nothing of what they
-    leave, or no more than `MANY` do, and foretells recordings left out better; in place of one effect it must be as simple. None
-    elsewhere.
+    leave, or no more than `MANY` do, and foretells recordings left out better, and check recordings no worse; in place of one effect it
+    must be as simple. Of effects that leave a misfit on a density finer than the base's, it may leave as much, where it takes most of what
+    they miss check recordings by. None elsewhere.
 
     `base`: the plain fit; `named`: that with the effects, their `number`.
     """
     most = AT_NOISE + (WRONG_NAME if number < MANY else 1.0) * max(named.chi2_per_sample - AT_NOISE, 0.0)  # chi2/N
-    learned = learn(base, recordings, bench, progress, most * named.data_count)
+    hats, chosen = base.choices.knots, named.choices.knots
+    finer = named.chi2_per_sample > LEAVES_MISFIT and None not in (hats, chosen) and chosen > hats
+    learned = learn(base, recordings, bench, progress, np.inf if finer else most * named.data_count)
     if learned is None or learned.place.block in blocks or not (number > 1 or learned.place.simple):
         return None
-    far = learned.result.chi2_per_sample > most or learned.left_out[1] > left_out(named.problem, named.solution).mean()
-    return None if far else learned
+    rows = check_errors(named.actuator, learned.result.actuator, check, bench)
+    before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
+    if after > WORSE[0] * before + WORSE[1] * len(rows):
+        return None
+    left = learned.result.chi2_per_sample
+    if left <= most and not learned.left_out[1] > left_out(named.problem, named.solution).mean():
+        return learned
+    return learned if finer and left < AS_MUCH * named.chi2_per_sample and after < FORETOLD * before else None
 
 
 def with_learned_term(found, base, recordings, bench, check=(), progress=None, learned=None):

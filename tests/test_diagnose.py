@@ -836,7 +836,7 @@ def test_a_learned_function_shows_an_effect_to_be_the_wrong_name(monkeypatch, le
     monkeypatch.setattr(learned_module, "learn", lambda *a: learned)
     monkeypatch.setattr(learned_module, "left_out", lambda *a: np.array([20.0, 60.0]))
     rows = [{"rms_before": 1.5e-7, "rms_after": checks * 5e-8, "noise_rms": 5e-8}]
-    monkeypatch.setattr(module, "check_errors", lambda *a: rows)
+    monkeypatch.setattr(learned_module, "check_errors", lambda *a: rows)
     best = trial("quartic_magnetostriction", named, 6e4)
     best = dataclasses.replace(best, candidate=dataclasses.replace(best.candidate, block="magnetostriction"))
     reached = Reached(named, [(best, [best], [best], plain)], {})
@@ -861,3 +861,35 @@ def test_a_learned_function_shows_an_effect_to_be_the_wrong_name(monkeypatch, le
         evidence = dataclasses.replace(evidence, reached=several)
         serves = number == 3 and leaves < left and left_out < 70 and checks < 4 and block == "coil"
         assert (asked("group", several.current) is learned) == serves
+
+
+@pytest.mark.parametrize(
+    ("knots", "leaves", "block", "checks", "wrong"),
+    [
+        ((48, 32), 2.5, "coil", 1.2, True),
+        ((18, 13), 2.5, "coil", 1.2, False),
+        ((48, 32), 3.0, "coil", 1.2, False),
+        ((48, 32), 2.5, "sensor", 1.2, False),
+        ((48, 32), 2.5, "coil", 2.4, False),
+    ],
+    ids=["wrong", "on the same hats", "leaves more", "the form of its law", "foretells as well"],
+)
+def test_effects_that_took_finer_hats_are_wrong_where_a_function_foretells_the_checks(monkeypatch, knots, leaves, block, checks, wrong):
+    """A sensor's law on hats of 48 x 32 left 2.3 of an eddy loss that depends on M, and missed check recordings by 3.4 of their noise."""
+
+    def result(value, knots):
+        return SimpleNamespace(
+            chi2_per_sample=value, data_count=900, problem=None, solution=None, actuator=None, choices=Choices(knots=knots)
+        )
+
+    term = SimpleNamespace(counts=(20, 1))
+    place = Place(block, ("magnetization", "flux_rate"), 900.0, 0.96, 0.1, 1.0, 0.2, term)
+    learned = Learned(place, term, result(leaves, (36, 24)), None, (100.0, 70.0), 0.96)
+    targets = []
+    monkeypatch.setattr(learned_module, "learn", lambda *a: targets.append(a[-1]) or learned)
+    monkeypatch.setattr(learned_module, "left_out", lambda *a: np.array([20.0, 60.0]))
+    rows = [{"rms_before": 2.6, "rms_after": checks, "noise_rms": 1.0}]
+    monkeypatch.setattr(learned_module, "check_errors", lambda *a: rows)
+    found = learned_module.better_learned(result(71.0, (18, 13)), result(2.4, knots), {"sensor"}, (), None, 1, [1])
+    assert (found is learned) == wrong
+    assert (targets[0] == np.inf) == (knots > (18, 13))  # on the first hats it need not come as far

@@ -14,6 +14,7 @@ from fitting.demo import concealed_actuator, record
 from fitting.learned import Learned, _needless, band, chosen_places, described, left_out, prediction_interval, region
 from fitting.nonparametric import Place, evidence, prior_deviations
 from fitting.result import write_model
+from fitting.setup import Choices
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.effects.learned_term import OUTPUTS, PLACES, LearnedTerm
@@ -252,6 +253,50 @@ class FieldKink(AbstractEffect):
     @classmethod
     def parameters(cls):
         return {}
+
+
+def learned_of(place, left_out, leaves, knots=(18, 13)):
+    """A `Learned` that a fit ended with."""
+    result = types.SimpleNamespace(chi2_per_sample=leaves, choices=Choices(knots=knots))
+    return Learned(place, place.term, result, np.eye(1), (266.0, left_out), 0.9)
+
+
+def placed(block, variables, evidence, counts=(20,)):
+    return Place(block, variables, evidence, 0.9, 0.1, 1.0, 0.4, types.SimpleNamespace(counts=counts))
+
+
+def test_simple_functions_of_other_blocks_are_tried_where_no_leader_serves(monkeypatch):
+    """A loss in one direction of the flux alone: a function of the current and its rate led by its evidence, and foretold nothing."""
+    leads, alone = placed("source", ("current", "current_rate"), 1232.0, (10, 7)), placed("source", ("current_rate",), 898.0)
+    both, coil = placed("coil", ("flux_rate", "field"), 920.0, (10, 6)), placed("coil", ("flux_rate",), 768.0)
+    rod, weak = placed("mechanics", ("displacement_rate",), 606.0), placed("hysteresis", ("field_rate",), 400.0)
+    outcome = {"source": (2.4, 480.0), "coil": (6.5, 154.0), "mechanics": (11.0, np.nan)}
+    fitted = []
+
+    def fit_term(base, place, recordings, bench, progress=None, target=np.inf, choices=None):
+        fitted.append((place, choices))
+        if choices is not None:
+            return learned_of(place, 1e3, {(26, 18): 1.5, (36, 24): 1.05}.get(choices.knots, 1.02), choices.knots)
+        return learned_of(place, outcome[place.block][1], outcome[place.block][0])
+
+    monkeypatch.setattr(learned_module, "fit_term", fit_term)
+    monkeypatch.setattr(learned_module, "locate_places", lambda *a: [leads, both, alone, coil, rod, weak])
+    found = learned_module.learn(None, (), None)
+    assert found.place is coil and found.left_out == (266.0, 154.0)
+    assert [p for p, choices in fitted if choices is None] == [alone, leads, coil, rod]  # the weak one is not worth a fit
+    assert found.result.choices.knots == (36, 24) and fitted[-1][1].knots == (36, 24)  # at the noise there is no finer one
+    # a target speaks for itself
+    fitted.clear()
+    assert learned_module.learn(None, (), None, target=900.0) is None and len(fitted) == 2
+
+
+def test_finer_hats_beside_a_term_must_take_half_of_what_is_left(monkeypatch):
+    coil = placed("coil", ("flux_rate",), 768.0)
+    monkeypatch.setattr(learned_module, "locate_places", lambda *a: [coil])
+    on = {None: (6.5, (18, 13)), (26, 18): (4.0, (26, 18))}
+    monkeypatch.setattr(learned_module, "fit_term", lambda *a, choices=None: learned_of(coil, 154.0, *on[choices and choices.knots]))
+    found = learned_module.learn(None, (), None)
+    assert found.result.choices.knots == (18, 13) and found.result.chi2_per_sample == 6.5
 
 
 def test_a_term_is_fitted_jointly_with_the_density():
