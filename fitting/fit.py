@@ -24,7 +24,7 @@ from .finer import (
     hats_of_step,
 )
 from .joint import compiled, data_residual, prior_matrix, solve
-from .memories import apart, best_memory, is_strained, rests_of, settled
+from .memories import apart, believed, best_memory, is_strained, rests_of, settled
 from .outcome import (
     AT_BOUND,
     LOST,
@@ -151,7 +151,7 @@ def _density_of(problem, solution):
 def _start_memories(problem, z, actuator, bench, names, choices, spectra, start, report, target, patient: bool = True):
     """The fit from each start memory until one meets the noise; the best of them. The first by itself, then the others side by side.
 
-    One that the bench does not state is taken only where it meets the noise and none that it states does. Where the best has levels
+    One that the bench does not state is taken only where it meets the noise and none that it states does: `believed`. Where the best has levels
     far from their prior, a right one may have ended in a false valley: from there the others are tried once more.
     """
     rests, others = rests_of(bench, choices)
@@ -164,7 +164,7 @@ def _start_memories(problem, z, actuator, bench, names, choices, spectra, start,
     ended = [run(rests[0], (problem, z))(report)]
     if not settled(*ended[0][:2]) and not ended[0][1].interrupted:
         ended = _beside(ended[0], [run(rest) for rest in apart((*rests, *others), problem)[1:]], report)
-    best = best_memory([row for row in ended if row[2].rest not in others or settled(*row[:2])])
+    best = best_memory(believed(ended, rests))
     if start is None and len(ended) > 1 and is_strained(*best[:2]):
         again = [row[2].rest for row in ended if row[2].rest in rests and row[1].chi2 > best[1].chi2]
         best = best_memory(_beside(best, [_from_there(best, rest, actuator, bench, names, spectra) for rest in again], report))

@@ -45,6 +45,15 @@ def is_strained(problem, solution) -> bool:
     return _strain(problem, solution) > STRAINED * problem.layout.memories
 
 
+def believed(ended, stated):
+    """Of fits from several start memories, (problem, solution, choices), those from the `stated` ones and the others that contradict
+    these: one that meets the noise with calm levels, or with levels that are not strained where those of all stated ones are."""
+    own, others = ([row for row in ended if (row[2].rest in stated) == kind] for kind in (True, False))
+    strained = all(is_strained(*row[:2]) for row in own)
+    met = [row for row in others if row[1].chi2 < REST_SETTLED * row[0].data_count and not is_strained(*row[:2])]
+    return own + [row for row in met if strained or settled(*row[:2])]
+
+
 def memory_is_told(result) -> bool:
     """Whether the recordings' levels say that their start memory is the right one: beside any other they are seldom calm."""
     memories = result.problem.layout.memories

@@ -11,7 +11,7 @@ import pytest
 from fitting.density import hat_basis
 from fitting.fit import fit
 from fitting.joint import Solution
-from fitting.memories import best_memory
+from fitting.memories import believed, best_memory
 from fitting.recipe import lag_recipe
 from fitting.setup import Choices
 from fitting.starts import unreached_row
@@ -179,6 +179,28 @@ def test_the_levels_tell_the_start_memory_where_much_is_amiss(ended, best):
         return known, SimpleNamespace(chi2=648 * chi2n, z=z), Choices(rest=name)
 
     assert best_memory([row(name, *found) for name, found in ended.items()])[2].rest == best
+
+
+@pytest.mark.parametrize(
+    ("stated", "other", "taken"),
+    [
+        ((1.33, 7965.0), (0.89, 2.5), "demagnetized"),  # positive saturation was stated: met nearly, by levels of micrometres
+        ((1.33, 7965.0), (0.89, 60.0), "positive"),  # strained as well
+        ((1.33, 7965.0), (1.30, 2.5), "positive"),  # not met
+        ((1.33, 8.0), (0.89, 2.5), "positive"),  # what is stated is believed where its levels do not speak against it
+        ((1.33, 8.0), (0.89, 1.0), "demagnetized"),  # unless another is calm and met
+    ],
+    ids=["contradicted", "both strained", "not met", "not contradicted", "settled"],
+)
+def test_what_the_bench_states_is_believed_unless_its_levels_contradict_it(stated, other, taken):
+    known = SimpleNamespace(data_count=648, layout=SimpleNamespace(memories=8))
+
+    def row(name, chi2n, strain):
+        z = np.append(np.ones(5), np.full(8, np.sqrt(strain / 8)))
+        return known, SimpleNamespace(chi2=648 * chi2n, z=z), Choices(rest=name)
+
+    ended = [row("positive", *stated), row("negative", 5.3, 6549.0), row("demagnetized", *other)]
+    assert best_memory(believed(ended, ("positive",)))[2].rest == taken
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def test_lines_of_each_on_several_grids(result):
     """Two grids whose recordings stand in another order among all, and levels of their own."""
     one, problem = result.problem.predictors[1], result.problem
     drive, dt = one.drives[0], one.steps[0]
-    two = dataclasses.replace(one, drives=(drive[:2], drive[2:, ::2]), steps=(dt[:2], 2 * dt[2:]), index=(1, 2, 0))
+    two = dataclasses.replace(one, drives=(drive[:2], drive[2:, ::2]), steps=(dt[:2], 2 * dt[2:]), index=(1, 2, 0), periods=2 * one.periods)
     z = jnp.asarray(np.stack([result.refined.z, 1.01 * result.refined.z]))
     levels = jnp.asarray([[300.0, -200.0, 100.0], [0.0, 50.0, -400.0]])
     actuators = [problem.layout.actuator(problem.template, row) for row in z]
