@@ -4,6 +4,7 @@ The places that lead in `nonparametric` are fitted for real, all unknowns at onc
 The one that foretells recordings left out one at a time best is kept, if it does so better than the model without it.
 """
 
+import contextlib
 import dataclasses
 
 import jax
@@ -22,6 +23,7 @@ from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .nonparametric import ONE, Place, locate_places
 from .setup import build_problem
+from .task import Late
 from .together import let_go
 from .uncertainty import WIDEN, covariance
 from .verdict import WORSE, asked_for
@@ -193,10 +195,11 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
     tried = []
 
     def try_all(chosen):
-        for place in chosen:
-            if not _needless(place, tried):
-                let_go()
-                tried.append(fit_term(base, place, recordings, bench, progress, target))
+        with contextlib.suppress(Late):  # what was tried by then
+            for place in chosen:
+                if not _needless(place, tried):
+                    let_go()
+                    tried.append(fit_term(base, place, recordings, bench, progress, target))
         tried.sort(key=lambda t: np.nan_to_num(t.left_out[1], nan=np.inf))
         return any(t.worth for t in tried)
 
@@ -217,11 +220,12 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
 def _on_finer_hats(learned, base, recordings, bench, progress) -> Learned:
     """The same term beside finer and finer hats, as long as each takes half of what those before leave: the density was chosen
     without it. What it foretells of recordings left out is that of the first: finer cells are seen by one recording alone."""
-    while FINER_FROM[0] < learned.result.chi2_per_sample < REFINE_BESIDE and (choices := finer_hats(learned.result.choices)):
-        finer = fit_term(base, learned.place, recordings, bench, progress, choices=choices[0])
-        if not finer.result.chi2_per_sample - 1 < COARSE * (learned.result.chi2_per_sample - 1):
-            break
-        learned = dataclasses.replace(finer, left_out=learned.left_out)
+    with contextlib.suppress(Late):
+        while FINER_FROM[0] < learned.result.chi2_per_sample < REFINE_BESIDE and (choices := finer_hats(learned.result.choices)):
+            finer = fit_term(base, learned.place, recordings, bench, progress, choices=choices[0])
+            if not finer.result.chi2_per_sample - 1 < COARSE * (learned.result.chi2_per_sample - 1):
+                break
+            learned = dataclasses.replace(finer, left_out=learned.left_out)
     return learned
 
 

@@ -15,6 +15,7 @@ from fitting.learned import Learned, _needless, band, chosen_places, described, 
 from fitting.nonparametric import Place, evidence, prior_deviations
 from fitting.result import write_model
 from fitting.setup import Choices
+from fitting.task import Late
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.effects.learned_term import OUTPUTS, PLACES, LearnedTerm
@@ -297,6 +298,21 @@ def test_finer_hats_beside_a_term_must_take_half_of_what_is_left(monkeypatch):
     monkeypatch.setattr(learned_module, "fit_term", lambda *a, choices=None: learned_of(coil, 154.0, *on[choices and choices.knots]))
     found = learned_module.learn(None, (), None)
     assert found.result.choices.knots == (18, 13) and found.result.chi2_per_sample == 6.5
+
+
+@pytest.mark.parametrize("late", ["another place", "finer hats"])
+def test_what_was_learned_when_the_time_is_over_is_kept(monkeypatch, late):
+    coil, source = placed("coil", ("flux_rate",), 768.0), placed("source", ("current_rate",), 760.0)
+
+    def fit_term(base, place, *more, choices=None):
+        if choices is not None if late == "finer hats" else place is source:
+            raise Late
+        return learned_of(place, 154.0, 6.5 if place is coil and choices is None else 20.0)
+
+    monkeypatch.setattr(learned_module, "locate_places", lambda *a: [coil, source])
+    monkeypatch.setattr(learned_module, "fit_term", fit_term)
+    found = learned_module.learn(None, (), None)
+    assert found.place is coil and found.result.chi2_per_sample == 6.5
 
 
 def test_a_term_is_fitted_jointly_with_the_density():
