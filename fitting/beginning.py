@@ -35,14 +35,19 @@ class Beginning:
             **{"plain": None, "before_means": None, **more},
         )
 
-    def from_plain(self, plain, candidates):
-        """Hum or heat that shows in what the plain fit leaves, taken out; None where there is none."""
-        if found := hum_on_harmonics(self.task, self.adopted, plain, candidates):
+    def without_hum_or_heat(self, task, fit, candidates=()):
+        """The task without hum or heat that shows in what a fit leaves, all that is adopted then, and its plain fit; None where there is
+        none."""
+        if found := hum_on_harmonics(task, self.adopted, fit, candidates):
             cleaned, hum, freed = found
-            return self.with_cleaned(cleaned, [*self.adopted, hum], plain=freed)
-        if found := heat_on_harmonics(self.task, self.adopted, plain):
-            cleaned, heat, freed = found
-            return self.with_cleaned(cleaned, heat, plain=freed)
+            return cleaned, [*self.adopted, hum], freed
+        return heat_on_harmonics(task, self.adopted, fit)
+
+    def from_plain(self, plain, candidates):
+        """From recordings without hum or heat that shows in what the plain fit leaves; None where there is none."""
+        if found := self.without_hum_or_heat(self.task, plain, candidates):
+            cleaned, adopted, freed = found
+            return self.with_cleaned(cleaned, adopted, plain=freed)
         return None
 
     def with_own_means(self, plain, candidates):
@@ -66,10 +71,8 @@ class Anew:
         """Whether hum or heat shows beside the effects of a fit, or the plain one was in a false valley."""
         begun, task = self.begun, self.begun.task.sparing
         with contextlib.suppress(Late):
-            if found := hum_on_harmonics(task, begun.adopted, current):
-                self.found = begun.with_cleaned(found[0], [*begun.adopted, found[1]])
-            elif found := heat_on_harmonics(task, begun.adopted, current):
-                self.found = begun.with_cleaned(found[0], found[1])
+            if found := begun.without_hum_or_heat(task, current):
+                self.found = begun.with_cleaned(*found[:2])
             elif not self.zero and (better := better_valley(task, begun.plain, self.candidates, current)):
                 self.found = begun.on(plain=better)
         return self.found is not None

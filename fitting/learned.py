@@ -15,13 +15,14 @@ from magjax.effects.learned_term import OUTPUTS, UNITS, LearnedTerm
 from magjax.programs import kept
 from magjax.simulate import run_chain
 
-from .attribute import AT_NOISE
+from .attribute import AT_NOISE, excess_of
 from .check import check_errors, foretold_text
 from .diagnosis import misfit
 from .finer import FINER_FROM, REFINE_BESIDE, finer_hats
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
 from .nonparametric import ONE, Place, locate_places
+from .plain import COARSE
 from .setup import build_problem
 from .task import Late
 from .together import let_go
@@ -38,7 +39,6 @@ MANY = 3  # effects in place of which a function that leaves no more is the bett
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 AS_MUCH, FORETOLD = 1.1, 0.5  # of the chi2 of effects on finer hats, and of what they miss check recordings by, that one may leave
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
-COARSE = 0.5  # of what a term leaves above the noise, that finer hats beside it may leave
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 BASE_LOSSES = {  # of the base, that act as a constant times a rate
     ("coil", "flux_rate"): ("coil.R_eddy", "coil.k_eddy", "effects.eddy_currents.k"),
@@ -223,7 +223,7 @@ def _on_finer_hats(learned, base, recordings, bench, progress) -> Learned:
     with contextlib.suppress(Late):
         while FINER_FROM[0] < learned.result.chi2_per_sample < REFINE_BESIDE and (choices := finer_hats(learned.result.choices)):
             finer = fit_term(base, learned.place, recordings, bench, progress, choices=choices[0])
-            if not finer.result.chi2_per_sample - 1 < COARSE * (learned.result.chi2_per_sample - 1):
+            if not excess_of(finer.result, 1.0) < COARSE * excess_of(learned.result, 1.0):
                 break
             learned = dataclasses.replace(finer, left_out=learned.left_out)
     return learned

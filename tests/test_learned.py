@@ -258,7 +258,7 @@ class FieldKink(AbstractEffect):
 
 def learned_of(place, left_out, leaves, knots=(18, 13)):
     """A `Learned` that a fit ended with."""
-    result = types.SimpleNamespace(chi2_per_sample=leaves, choices=Choices(knots=knots))
+    result = types.SimpleNamespace(chi2_per_sample=leaves, data_count=729, choices=Choices(knots=knots))
     return Learned(place, place.term, result, np.eye(1), (266.0, left_out), 0.9)
 
 
