@@ -128,6 +128,16 @@ def test_a_round_limit_is_a_hyperbola_about_the_hard_one():
     assert delivered[2] == pytest.approx(limit * (np.hypot(u + 1, 0.1) - np.hypot(u - 1, 0.1)) / 2, abs=1e-12)
 
 
+@pytest.mark.parametrize("softness", [0.0, 1e-6])
+def test_a_supply_of_two_unlike_voltages_limits_each_sign_by_its_own(softness):
+    command, limit, uneven = np.asarray(CURRENT), 0.6, 0.15
+    effect = effects.AmplifierClipping(inverse_limit=1 / limit, tau_L=0.0, softness=softness, unevenness=uneven)
+    delivered = np.asarray(run_chain(actuator(20).with_effect(effect), CURRENT, DT, 4, 2).current)
+    exact = np.clip(command, -(1 - uneven) * limit, (1 + uneven) * limit)
+    assert command.max() > 1.1 * (1 + uneven) * limit and command.min() < -1.1 * (1 - uneven) * limit
+    assert np.abs(delivered - exact).max() < 1e-6 * limit
+
+
 @pytest.mark.parametrize(
     "f,v_s,presliding,stribeck,tolerance",
     [(4e-7, 1e-7, 3e-7, 0, 0.02), (4e-7, 1e-7, 2e-6, 0, 0.02), (4e-7, 1e-3, 1e-8, 0, 0.03), (2e-6, 1e-5, 1e-7, 0, 0.02)]

@@ -17,7 +17,8 @@ class AmplifierClipping(AbstractEffect):
 
     The exact law, inside the step of (4), for the flux answers the current; L is of what the rod does not fill. With g = R / V_max a
     limit that nothing reaches is no limit, so there is no derivative at null: the screening tries limits just below what the
-    recordings ask for. In detail the flux of the rod counts, which otherwise tau_L stands for, and the limit may be round.
+    recordings ask for. In detail the flux of the rod counts, which otherwise tau_L stands for, the limit may be round, and that of one
+    sign higher than that of the other.
     """
 
     inverse_limit: Float[Array, ""] = param(
@@ -37,11 +38,16 @@ class AmplifierClipping(AbstractEffect):
         0.0, "1", "how round the limit is, as a hyperbola, of its voltage", low=0.0, scale=0.05, shape=True, detail=True, typical=(0.0, 0.3)
     )
 
+    unevenness: Float[Array, ""] = param(
+        0.0, "1", "how far the upper limit is above their mean, of it, and the lower one below", low=-0.9, high=0.9, scale=0.05, shape=True, detail=True,
+        typical=(-0.2, 0.2),
+    )  # fmt: skip
+
     name = "amplifier_clipping"
     block = "source"
     law = (
-        "|I + tau_L dI/dt + linkage dB/dt| <= 1 / g, I = command wherever that allows it; with softness s the voltage asked for, over its limit, "
-        "u becomes (sqrt((u + 1)^2 + s^2) - sqrt((u - 1)^2 + s^2)) / 2"
+        "|I + tau_L dI/dt + linkage dB/dt - a / g| <= 1 / g, a the unevenness, I = command wherever that allows it; with softness s the voltage "
+        "asked for, from its mean limit and over its limit, u becomes (sqrt((u + 1)^2 + s^2) - sqrt((u - 1)^2 + s^2)) / 2"
     )
     source = "voltage compliance of a linear amplifier, |L dI/dt + R I + N A dB/dt| <= V_max"
     signature = "flattened crests at the largest amplitude, at high frequency first; nothing below the limit"
@@ -68,7 +74,8 @@ class AmplifierClipping(AbstractEffect):
     def _current(self, command, before, flux_rate, h):
         limit = 1 / jnp.maximum(self.inverse_limit, 1 / NO_LIMIT)
         a = self.tau_L / h
-        middle, room = (a * before - self.linkage * flux_rate) / (1 + a), limit / (1 + a)
+        room = limit / (1 + a)
+        middle = (a * before - self.linkage * flux_rate) / (1 + a) + self.unevenness * room
         u, is_round = (command - middle) / room, self.softness > 0
         width = jnp.where(is_round, self.softness, 1.0) ** 2
         soft = middle + 0.5 * room * (jnp.sqrt((u + 1) ** 2 + width) - jnp.sqrt((u - 1) ** 2 + width))
