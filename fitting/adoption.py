@@ -28,7 +28,10 @@ from .verdict import FAR_FROM_NOISE, HALF
 
 LITTLE_LEFT = 0.2  # share of a chi2/N that an effect may leave for a finer density to be tried beside it, however far that is
 FAR_BESIDE = 2.0  # chi2/N beside an effect from which a further one is asked for before a finer density
-LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs
+LEADS_WITHIN, RIVALS_OF_TWO, SAME = 5.0, 3, 1e-3  # of the best's chi2, how many, and how far apart in theirs,
+SAME_OF_KIN = 0.03  # those of one family
+PAIRS_END = 2.0  # times the chi2/N that they must meet, at which they end early: what a step promises is less than what details bring
+AS_HIGH, AHEAD = 0.9, 4  # share of the highest score beside a rival, from which effects are tried with it, and how many
 
 
 def promises(base, result, candidates) -> bool:
@@ -39,20 +42,22 @@ def promises(base, result, candidates) -> bool:
     return result.chi2_per_sample > FAR_BESIDE and promised > least
 
 
-def of_two(task, best, left, good):
-    """The best and the scores beside it; or a rival's, with which a further effect explains what the best leaves.
+def of_two(task, best, left, good, with_others=None):
+    """The best and the scores beside it; or a rival's, with which a further effect explains what the best leaves; `with_others`: the
+    fit of the best with what was found beside it, if any was.
 
     One effect with shapes of its own imitates two others better than either of them alone; and where none takes most, the
     first to be found is seldom one of the two. Rivals of other directions are looked ahead from by their scores.
     """
-    if best.result.chi2_per_sample < MISFIT:
+    standing = best.result if with_others is None else with_others
+    if standing.chi2_per_sample < MISFIT:
         return best, left
     tried, ahead = [best], []
-    near = MISFIT if best.explained_share > IMITATES else FAR_FROM_NOISE
+    near = MISFIT if best.explained_share > IMITATES and with_others is None else FAR_FROM_NOISE
     for rival in sorted((t for t in good if t is not best), key=lambda t: chi2_of(t.result)):
         if chi2_of(rival.result) > LEADS_WITHIN * chi2_of(best.result) or len(tried) > RIVALS_OF_TWO:
             break
-        if any(abs(chi2_of(t.result) / chi2_of(rival.result) - 1) < SAME or of_one_family(t, rival) for t in tried):
+        if any(abs(chi2_of(t.result) / chi2_of(rival.result) - 1) < (SAME_OF_KIN if of_one_family(t, rival) else SAME) for t in tried):
             continue
         tried.append(rival)
         scores = screened(rival.result, task.choices)
@@ -60,15 +65,20 @@ def of_two(task, best, left, good):
         promised = chi2_of(rival.result) - first.z**2
         if first.z**2 > HALF * excess and promised < chi2_of(best.result) - MIN_DROP:
             ahead.append((promised, rival, scores))
-    least = chi2_of(best.result) - max(BIC_DROP, HALF * excess_of(best.result))
+    least = chi2_of(standing) - max(BIC_DROP, HALF * excess_of(standing))
     of_one = np.log(best.result.data_count)  # what BIC charges a parameter
-    useful = min(near * best.result.data_count, least + best.parameters * of_one)  # a pair that cannot come there ends early
+    useful = min(PAIRS_END * near * best.result.data_count, least + best.parameters * of_one)  # a pair that cannot come there ends early
+
+    def beside(rival, second):
+        return lambda say: to_the_end(task.on(progress=say), rival.result, second, excess_of(rival.result), useful)
+
     for _, rival, scores in sorted(ahead, key=lambda row: row[0]):
-        pair = to_the_end(task, rival.result, scores[0], excess_of(rival.result), useful)
-        cost = (rival.parameters + pair.parameters - best.parameters) * of_one
-        met = pair.physical and pair.result.chi2_per_sample < near
-        if met and chi2_of(pair.result) + cost < least:
-            return rival, scores
+        seconds = [c for c in scores[:AHEAD] if abs(c.z) >= AS_HIGH * abs(scores[0].z)]  # at null one law scores about as its like
+        for pair in together([beside(rival, c) for c in seconds], task.progress):
+            cost = (rival.parameters + pair.parameters - best.parameters) * of_one
+            met = pair.physical and pair.result.chi2_per_sample < near
+            if met and chi2_of(pair.result) + cost < least:
+                return rival, scores
     return best, left
 
 

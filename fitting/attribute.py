@@ -77,8 +77,8 @@ COMPANIONS = {
 # the density bends to them further than its tangent tells, and a rough one scores as they do
 LIKE_DENSITY = ("mean_field", "reversible_magnetization", "accommodation")
 FEEDBACKS = ("stress_feedback",)  # its column says little where the base has bent to it: tried wherever it scores
-# thresholds act at their size as they do not next to none: tried where they score and no effect takes most
-THRESHOLDS = ("backlash", "coulomb_friction")
+# thresholds, and a mean that follows M, act at their size as they do not next to none: tried where they score and no effect takes most
+UNLIKE_NULL = ("backlash", "coulomb_friction", "accommodation")
 STRUCTURES = ("eddy_currents",)  # their column at null says little: at their real size they change which relays switch
 
 

@@ -83,12 +83,13 @@ def _nothing(result, name) -> bool:
     return abs(found.value - effect.parameters()[effect.amplitude].null) < NOTHING * (found.stderr or 0.0)
 
 
-def exchange(task, state, check=()):
+def exchange(task, state, check=()) -> bool:
     """Try the rivals of an effect adopted early once more, beside those that came later: they were compared under a misfit
-    that was not theirs. Where that changes one, the same goes for the last."""
-    changed = [_exchanged(task, state, index, check) for index in range(len(state.steps) - 1)]
-    if any(changed):
+    that was not theirs. Where that changes one, the same goes for the last. Whether any is another now."""
+    changed = any([_exchanged(task, state, index, check) for index in range(len(state.steps) - 1)])
+    if changed:
         _exchanged(task, state, len(state.steps) - 1)
+    return changed
 
 
 def both_found(steps) -> list:

@@ -29,6 +29,7 @@ SHAPE_GRIDS = {
     "excess_loss": {"rate_knee": (0.3, 10.0, 100.0)},
     "second_eddy_path": {"tau": (1e-4, 5e-4, 2e-3, 8e-3), "air": (0.05, 0.9)},
     "stress_feedback": {"inertia": (0.0, 5.0)},
+    "accommodation": {"pace": (0.0, 0.5)},  # a quick one scores as a mean field does, and leads there
     "magnetic_aftereffect": {"of_field": (0.05, 0.9)},
     "rate_dependent_switching": {"rate0": (1e3, 3e4, 1e6), "of_flux": (0.05, 0.9), "of_drive": (0.0, 0.9)},
     "second_mode": {"f2": tuple(150.0 * 1.09**k for k in range(36)), "xi2": (0.02, 0.1)},  # a mode is narrow

@@ -114,6 +114,8 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
     that was chosen beside the effects, the candidate of `state.form`, and whether the rest of the search is needless."""
     made_up = None
     for _round in range(MAX_EFFECTS):
+        if len(state.steps) > 1:  # a wrong pair leaves what a third would be tried for
+            candidates = _of_another_pair(task, base, state, candidates, check)
         top = leaders(candidates)
         hidden = not top or abs(top[0].z) < Z_THRESHOLD
         if hidden:
@@ -157,6 +159,22 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
         if ends(state.current):
             return task, made_up, True
     return task, made_up, False
+
+
+def _of_another_pair(task, base, state, candidates, check) -> list:
+    """The scores beside the effects found: two that leave a misfit are exchanged for rivals where these leave less. Far from the noise
+    the first one gives way to a rival with which one of its own leaders comes nearer, and the next round finds that one."""
+    if MISFIT < state.current.chi2_per_sample < FAR_FROM_NOISE:
+        return screened(state.current, task.choices) if exchange(task, state, check) else candidates
+    if state.current.chi2_per_sample < FAR_FROM_NOISE:
+        return candidates
+    first, _, good, _ = state.steps[0]
+    other, left = of_two(task, first, candidates, good, state.current)
+    if other is first:
+        return candidates
+    state.steps, state.current = [], base
+    state.adopt(other, good)
+    return left
 
 
 def _best_of(trials, hidden: bool = False):

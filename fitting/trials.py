@@ -8,10 +8,11 @@ from .attribute import (
     FEEDBACKS,
     MIN_DROP,
     MISFIT,
+    ROUGH_CHI2,
     SETTLED_CHI2,
     STRUCTURES,
-    THRESHOLDS,
     TIE,
+    UNLIKE_NULL,
     WEAK_TIE,
     WORTH,
     Trial,
@@ -25,7 +26,7 @@ from .attribute import (
     try_effect,
 )  # fmt: skip
 from .together import SIDE_BY_SIDE, let_go, together
-from .verdict import FAR_FROM_NOISE, Z_THRESHOLD
+from .verdict import Z_THRESHOLD
 
 IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
@@ -68,11 +69,11 @@ def try_all(task, current, top, candidates, excess, under_way, near: float = 2 *
         top = [c for c in top[SIDE_BY_SIDE:] if not _needless(c, trials)]
     best = min((t for t in trials if t.physical), key=lambda t: t.bic_change, default=None)
     like = family(best.candidate, candidates, {t.name for t in trials}) if best else []
-    if best and best.explained_share < IMITATES and best.result.chi2_per_sample > FAR_FROM_NOISE:
+    if best and best.explained_share < IMITATES and best.result.chi2_per_sample > ROUGH_CHI2:
         # none takes most: a strong effect may act unlike its derivative at null
         known = {t.name for t in trials} | {c.name for c in like}
         others = [c for c in candidates if c.name not in known and c.visibility > 1e-3]
-        like += [c for c in others if abs(c.z) > (Z_THRESHOLD if c.name in THRESHOLDS else least)]
+        like += [c for c in others if abs(c.z) > (Z_THRESHOLD if c.name in UNLIKE_NULL else least)]
     if best:
         known = {t.name for t in trials} | {c.name for c in like}
         like += [c for c in candidates if c.name in FEEDBACKS and c.name not in known and abs(c.z) > Z_THRESHOLD]

@@ -37,7 +37,7 @@ CONFIRMED = (0.7, 1.0)  # of the check recordings' misfit that a name which they
 NO_BETTER = (3.0, 10.0, 0.8)  # chi2/N and check recordings' misfit from which what explains the one must lower the other to this share
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording, that a repair may leave
 AS_EXPECTED = 3.0  # chi2 per number of check recordings in units of what the fit expects to miss: there it errs as it says it does;
-NEARER = (6.0, 0.3)  # or within this, and this share of the plain fit's
+NEARER = (6.0, 0.3), (12.0, 0.1)  # or within this, and this share of the plain fit's
 SAYS_FOR = 10.0  # what these then say for a repair, as a fall of chi2, though their errors rise
 EXPECTED, AGAINST = 1.5, 0.1  # chi2 per number in these units, up to which a repair errs as it expects; share of its fall that they may speak against it
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
@@ -148,7 +148,7 @@ def as_expected(evidence) -> bool:
     if not foretell or foretell(evidence.reached.current) is None:
         return False
     now, before = (foretell(fit).whitened for fit in (evidence.reached.current, evidence.plain))
-    near = now < AS_EXPECTED or now < min(NEARER[0], NEARER[1] * before)
+    near = now < AS_EXPECTED or any(now < min(most, share * before) for most, share in NEARER)
     return near and foretell.says_for(evidence.reached.current, evidence.plain) > SAYS_FOR
 
 

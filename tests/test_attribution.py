@@ -774,20 +774,22 @@ def test_an_unknown_offers_no_repair_that_foretells_worse(monkeypatch, after, of
     assert ("The model offered is the plain one" in found.message) is not offered
 
 
-def searched(monkeypatch, ends, follows):
-    """`adoption.of_two` with trials that end at chi2/N `ends`; `follows`: after each the best score, and where a fit of it ends."""
+def searched(monkeypatch, ends, follows, with_others=None):
+    """`adoption.of_two` with trials that end at chi2/N `ends`; `follows`: after each the best scores, (name, z, where a fit of it ends)."""
     trials = [trial(n, x, base=110.0, direction=d) for n, x, d in ends]
-    scores = {id(t.result): [candidate(follows[t.name][0], follows[t.name][1])] for t in trials}
+    rows = {id(t.result): (follows[t.name] if isinstance(follows[t.name], list) else [follows[t.name]]) for t in trials}
+    scores = {k: [candidate(name, z) for name, z, _ in row] for k, row in rows.items()}
     monkeypatch.setattr(fitting.adoption, "screened", lambda result, choices: scores[id(result)])
 
     def fitted(task, result, c, excess, target):
         """What ends above the target is of no use: it may end anywhere."""
-        chi2n = next(follows[t.name][2] for t in trials if t.result is result)
+        chi2n = next(end for name, _, end in rows[id(result)] if name == c.name)
         return trial(c.name, chi2n if chi2n * COUNT < target else 99.0, 2)
 
     monkeypatch.setattr(fitting.adoption, "to_the_end", fitted)
     best = trials[0]
-    return fitting.adoption.of_two(Task((), None), best, scores[id(best.result)], trials)[0].name
+    standing = None if with_others is None else trial("pair", with_others).result
+    return fitting.adoption.of_two(Task((), None), best, scores[id(best.result)], trials, standing)[0].name
 
 
 def test_where_no_effect_takes_most_it_is_looked_ahead_from_each(monkeypatch):
@@ -804,6 +806,53 @@ def test_where_one_effect_takes_most_two_must_meet_the_noise(monkeypatch):
     follows = {"second_eddy_path": ("creep", 10.0, 4.8)}
     assert searched(monkeypatch, ends, follows | {"transport_delay": ("duffing_stiffness", 74.0, 1.1)}) == "transport_delay"
     assert searched(monkeypatch, ends, follows | {"transport_delay": ("duffing_stiffness", 74.0, 1.7)}) == "second_eddy_path"
+
+
+def test_beside_a_rival_all_that_score_about_as_high_are_looked_ahead_to(monkeypatch):
+    """An after-effect behind a lag scores as structural damping does, and one of its kin leaves 5 % less than the lag, alone."""
+    kin = [("second_eddy_path", 113.0, (1, 0, 0)), ("sensor_lag", 118.5, (1, 0, 0))]
+    follows = {"second_eddy_path": ("structural_damping", 248.0, 58.0)}
+    rows = [("structural_damping", 251.0, 30.0), ("magnetic_aftereffect", 238.0, 2.4), ("creep", 150.0, 2.0)]
+    assert searched(monkeypatch, kin, follows | {"sensor_lag": rows}) == "sensor_lag"
+    assert searched(monkeypatch, kin, follows | {"sensor_lag": [rows[0], rows[2]]}) == "second_eddy_path"  # nowhere near as high
+    same = [kin[0], ("sensor_lag", 114.0, (1, 0, 0))]
+    assert searched(monkeypatch, same, follows | {"sensor_lag": rows}) == "second_eddy_path"
+    # beside what was found after the first one, half of what these two leave
+    assert searched(monkeypatch, kin, follows | {"sensor_lag": rows}, with_others=58.0) == "sensor_lag"
+    assert searched(monkeypatch, kin, follows | {"sensor_lag": rows}, with_others=3.5) == "second_eddy_path"
+
+
+@pytest.mark.parametrize(
+    ("left", "other", "changes", "steps"),
+    [(1.2, "sensor_lag", True, ["second_eddy_path", "creep"]), (5.0, "sensor_lag", True, ["transport_delay", "creep"]),
+     (5.0, "sensor_lag", False, ["second_eddy_path", "creep"]), (58.0, "sensor_lag", True, ["sensor_lag"]),
+     (58.0, "second_eddy_path", True, ["second_eddy_path", "creep"])],
+    ids=["met", "exchanged", "not exchanged", "begun anew", "no other"],
+)  # fmt: skip
+def test_a_wrong_pair_is_left_before_a_third_is_tried(monkeypatch, left, other, changes, steps):
+    first, kin, second = trial("second_eddy_path", 113.0, base=240.0), trial("sensor_lag", 118.0, base=240.0), trial("creep", left, base=113.0)
+    base = trial("none", 240.0).result
+    state = Reached(base, [], {})
+    for best, good in ((first, [first, kin]), (second, [second])):
+        state.adopt(best, good)
+
+    def exchanged(task, state, check):
+        if changes:
+            state.steps[0] = (trial("transport_delay", 110.0), *state.steps[0][1:])
+        return changes
+
+    def of_two(task, best, scores, good, standing):
+        assert best is first and standing is second.result and good == [first, kin]
+        return next(t for t in good if t.name == other), scores if other == best.name else ["of the other"]
+
+    monkeypatch.setattr(fitting.search, "exchange", exchanged)
+    monkeypatch.setattr(fitting.search, "of_two", of_two)
+    monkeypatch.setattr(fitting.search, "screened", lambda *a: ["screened"])
+    found = fitting.search._of_another_pair(Task((), None), base, state, ["given"], ())
+    assert [best.name for best, *_ in state.steps] == steps
+    assert found == (["screened"] if "transport_delay" in steps else ["of the other"] if steps == ["sensor_lag"] else ["given"])
+    if steps == ["sensor_lag"]:
+        assert state.current is kin.result and state.steps[0][3] is base
 
 
 @pytest.mark.parametrize(("before", "after", "whole"), [(1.5, 0.95, True), (1.2, 0.94, False), (1.5, 1.1, False), (2.9, 0.99, True)])
@@ -992,20 +1041,23 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
 
 
 @pytest.mark.parametrize(
-    ("leader", "z", "tried"),
-    [(69.0, 300.0, ["second_mode", "backlash"]), (69.0, 22.0, ["second_mode", "backlash"]), (69.0, 4.0, ["second_mode"]), (5.0, 300.0, ["second_mode"])],
-    ids=["far", "far with a low score", "far with none", "near"],
+    ("before", "leader", "z", "tried"),
+    [
+        (100.0, 69.0, 300.0, ["second_mode", "backlash"]), (100.0, 69.0, 22.0, ["second_mode", "backlash"]), (100.0, 69.0, 4.0, ["second_mode"]),
+        (100.0, 5.0, 300.0, ["second_mode"]), (12.0, 6.5, 22.0, ["second_mode", "backlash"]), (5.0, 2.8, 22.0, ["second_mode"]),
+    ],
+    ids=["far", "far with a low score", "far with none", "most", "less far", "what a rough density leaves"],
 )  # fmt: skip
-def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, leader, z, tried):
+def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, before, leader, z, tried):
     """The score of a strong effect is that of its derivative at null, which may look like nothing it does; most of all that of a threshold."""
     ends = {"second_mode": leader, "backlash": 2.0, "creep": 50.0}
     rows = [candidate("second_mode", 600.0), candidate("backlash", z, (0, 1, 0)), candidate("creep", 100.0, (0, 0, 1))]
-    fitted = lambda task, current, c, excess, target: dataclasses.replace(trial(c.name, ends[c.name], base=100.0), candidate=c)
+    fitted = lambda task, current, c, excess, target: dataclasses.replace(trial(c.name, ends[c.name], base=before), candidate=c)
     monkeypatch.setattr(fitting.trials, "try_effect", fitted)
     monkeypatch.setattr(fitting.trials, "settled", lambda task, current, t, excess, target: t)
     task = Task((), None, progress=lambda *a: None)
-    current = trial("none", 100.0).result
-    assert names(fitting.trials.try_all(task, current, rows[:1], rows, 99.0 * COUNT, {})) == tried
+    current = trial("none", before).result
+    assert names(fitting.trials.try_all(task, current, rows[:1], rows, (before - 1.0) * COUNT, {})) == tried
 
 
 @pytest.mark.parametrize(("z", "tried"), [(9.7, True), (4.0, False)])

@@ -128,6 +128,33 @@ def test_a_round_limit_is_a_hyperbola_about_the_hard_one():
     assert delivered[2] == pytest.approx(limit * (np.hypot(u + 1, 0.1) - np.hypot(u - 1, 0.1)) / 2, abs=1e-12)
 
 
+def test_the_mean_of_accommodation_follows_the_path_of_the_magnetization():
+    """da = p (m - a) |dm|, exactly, along two loops of m of another size; at pace 0 it moves at reversals alone."""
+    from magjax.effects.base import Trial
+
+    act = actuator(20)
+    M_s = float(act.strained.M_s)
+
+    def means(effect, m):
+        at = lambda x: Trial(x, x * M_s, 0.0, 0.0, 0.0, 1e-3)
+        state, found = effect.start(at(m[0]), act), []
+        for x in m[1:]:
+            state = effect.advance(at(x), state, act)
+            found.append(float(state[0]))
+        return np.asarray(found)
+
+    m = np.concatenate([np.linspace(0, 0.6, 200), np.linspace(0.6, -0.2, 300)[1:], np.linspace(-0.2, 0.5, 200)[1:]])
+    exact, a = [], 0.0
+    for m0, m1 in zip(m[:-1], m[1:], strict=True):  # of a line of m along the path s
+        sign, p, s = np.sign(m1 - m0), 0.7, abs(m1 - m0)
+        settled = lambda m: m - sign / p
+        a = settled(m1) + (a - settled(m0)) * np.exp(-p * s)
+        exact.append(a)
+    assert means(effects.Accommodation(shift=100.0, pace=0.7), m) == pytest.approx(exact, abs=1e-5)
+    plain = means(effects.Accommodation(shift=100.0), m)
+    assert len(np.unique(plain)) == 3 and plain[-1] == pytest.approx(0.85 * 0.15 * m[200] + 0.15 * m[499], abs=1e-12)
+
+
 @pytest.mark.parametrize("softness", [0.0, 1e-6])
 def test_a_supply_of_two_unlike_voltages_limits_each_sign_by_its_own(softness):
     command, limit, uneven = np.asarray(CURRENT), 0.6, 0.15

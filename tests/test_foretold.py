@@ -125,7 +125,7 @@ def test_a_fit_that_cannot_be_simulated_foretells_nothing(null, plain):
     ("white", "before", "says", "found"),
     [
         (1.2, 2.0, 40.0, True), (5.0, 8.0, 40.0, False), (5.0, 28.0, 40.0, True), (9.0, 90.0, 40.0, False), (1.2, 2.0, 5.0, False),
-        (None, None, 0.0, False),
+        (9.2, 164.0, 4078.0, True), (13.0, 300.0, 4078.0, False), (None, None, 0.0, False),
     ],
 )  # fmt: skip
 def test_a_repair_that_errs_as_it_expects_may_be_named(white, before, says, found):
