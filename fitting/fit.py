@@ -46,6 +46,7 @@ from .together import together
 from .uncertainty import UNDERSMOOTH, correlations, covariance, estimates
 
 ASTRAY = 1e3  # chi2/N from which the signs of M in the loops that a fit began with are in doubt
+UNSETTLED = 1.5  # times its target, up to which a fit to what had not settled is asked whether more periods bring it there
 BRIEF = 5  # Jacobians that come near enough to tell how long a fit takes to settle
 
 
@@ -201,8 +202,8 @@ def _solved(build, problem, z, choices, start, target, say, patient: bool = True
     """A problem solved from z, with as many periods as it takes until they repeat: (problem, solution, choices).
 
     Where they do not, it begins anew with more, and a few Jacobians from there tell whether these are enough. A fit that goes on from
-    another, `start`, has its periods, and goes on with more where it is of use; if it is not `patient`, and has not converged with those,
-    whoever asked for it says whether it is."""
+    another, `start`, has its periods, and goes on with more where it is of use, or may come to be; if it is not `patient`, and has not
+    converged with those, whoever asked for it says whether it is."""
     at, chi2 = z, None
     while True:
         while start is None and (periods := periods_asked(problem, at, chi2)) != problem.predictors[0].periods_of_each:
@@ -223,7 +224,8 @@ def _solved(build, problem, z, choices, start, target, say, patient: bool = True
             target=target,
             progress=functools.partial(say, f"fit from {choices.rest}"),
         )
-        if found.interrupted or (start is not None and (found.chi2 > target or not (patient or found.converged))):
+        waits = patient or found.converged or found.chi2 > target
+        if found.interrupted or (start is not None and (found.chi2 > UNSETTLED * target or not waits)):
             return problem, found, choices
         at, chi2 = found.z, found.chi2
         periods = periods_asked(problem, at, chi2)

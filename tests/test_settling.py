@@ -108,10 +108,13 @@ def test_an_interrupt_while_periods_are_told_keeps_what_was_reached(monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("converged", "patient", "periods"), [(False, True, (8,)), (False, False, (3,)), (True, False, (8,))], ids=["patient", "not", "converged"]
+    ("converged", "patient", "target", "periods"),
+    [(False, True, np.inf, (8,)), (False, False, np.inf, (3,)), (True, False, np.inf, (8,)), (False, False, 4.0, (8,)), (True, True, 2.0, (3,))],
+    ids=["patient", "not", "converged", "near its target", "far from it"],
 )
-def test_a_trial_that_used_up_its_jacobians_waits_until_it_is_of_use(monkeypatch, converged, patient, periods):
-    """An amplifier's limit took 30 Jacobians of 3, 17 of 8 and 30 of 24 periods to end at four times what its rival met at once."""
+def test_a_trial_that_used_up_its_jacobians_waits_until_it_is_of_use(monkeypatch, converged, patient, target, periods):
+    """An amplifier's limit took 30 Jacobians of 3, 17 of 8 and 30 of 24 periods to end at four times what its rival met at once. An after-effect
+    ended at 11 with 3 periods, above a rival's 8, and at 2.4 with 8."""
     module = importlib.import_module("fitting.fit")
     monkeypatch.setattr(module, "periods_asked", lambda *_: (8,))
     monkeypatch.setattr(module, "_weights", lambda *_: None)
@@ -120,7 +123,7 @@ def test_a_trial_that_used_up_its_jacobians_waits_until_it_is_of_use(monkeypatch
     )
     given = problem([], 3), np.zeros(3), Choices(periods=(3,)), SimpleNamespace(problem=None, solution=SimpleNamespace(z=np.zeros(3)))
     monkeypatch.setattr(module, "_density", lambda start: None)
-    ended = module._solved(lambda *_: (problem([], 8), np.zeros(3)), *given, np.inf, lambda *_: None, patient)
+    ended = module._solved(lambda *_: (problem([], 8), np.zeros(3)), *given, target, lambda *_: None, patient)
     assert ended[2].periods == periods
 
 
