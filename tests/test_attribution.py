@@ -1040,24 +1040,25 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
     assert state.current.chi2_per_sample == min(ends, 1.6)
 
 
+@pytest.mark.parametrize("law", ["backlash", "accommodation"])
 @pytest.mark.parametrize(
     ("before", "leader", "z", "tried"),
     [
-        (100.0, 69.0, 300.0, ["second_mode", "backlash"]), (100.0, 69.0, 22.0, ["second_mode", "backlash"]), (100.0, 69.0, 4.0, ["second_mode"]),
-        (100.0, 5.0, 300.0, ["second_mode"]), (12.0, 6.5, 22.0, ["second_mode", "backlash"]), (5.0, 2.8, 22.0, ["second_mode"]),
+        (100.0, 69.0, 300.0, ["second_mode", "{}"]), (100.0, 69.0, 22.0, ["second_mode", "{}"]), (100.0, 69.0, 4.0, ["second_mode"]),
+        (100.0, 5.0, 300.0, ["second_mode"]), (12.0, 6.5, 22.0, ["second_mode", "{}"]), (5.0, 2.8, 22.0, ["second_mode"]),
     ],
     ids=["far", "far with a low score", "far with none", "most", "less far", "what a rough density leaves"],
 )  # fmt: skip
-def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, before, leader, z, tried):
+def test_where_no_leader_takes_most_the_others_are_tried_too(monkeypatch, before, leader, z, tried, law):
     """The score of a strong effect is that of its derivative at null, which may look like nothing it does; most of all that of a threshold."""
-    ends = {"second_mode": leader, "backlash": 2.0, "creep": 50.0}
-    rows = [candidate("second_mode", 600.0), candidate("backlash", z, (0, 1, 0)), candidate("creep", 100.0, (0, 0, 1))]
+    ends = {"second_mode": leader, law: 2.0, "creep": 50.0}
+    rows = [candidate("second_mode", 600.0), candidate(law, z, (0, 1, 0)), candidate("creep", 100.0, (0, 0, 1))]
     fitted = lambda task, current, c, excess, target: dataclasses.replace(trial(c.name, ends[c.name], base=before), candidate=c)
     monkeypatch.setattr(fitting.trials, "try_effect", fitted)
     monkeypatch.setattr(fitting.trials, "settled", lambda task, current, t, excess, target: t)
     task = Task((), None, progress=lambda *a: None)
     current = trial("none", before).result
-    assert names(fitting.trials.try_all(task, current, rows[:1], rows, (before - 1.0) * COUNT, {})) == tried
+    assert names(fitting.trials.try_all(task, current, rows[:1], rows, (before - 1.0) * COUNT, {})) == [n.format(law) for n in tried]
 
 
 @pytest.mark.parametrize(("z", "tried"), [(9.7, True), (4.0, False)])
