@@ -169,6 +169,8 @@ def _of_another_pair(task, base, state, candidates, check) -> list:
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         return candidates
     first, _, good, _ = state.steps[0]
+    density = first.result.choices.knots, first.result.choices.cells
+    good = [t for t in good if (t.result.choices.knots, t.result.choices.cells) == density]  # the others would be credited with a finer one
     other, left = of_two(task, first, candidates, good, state.current)
     if other is first:
         return candidates

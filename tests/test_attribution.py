@@ -831,9 +831,10 @@ def test_beside_a_rival_all_that_score_about_as_high_are_looked_ahead_to(monkeyp
 )  # fmt: skip
 def test_a_wrong_pair_is_left_before_a_third_is_tried(monkeypatch, left, other, changes, steps):
     first, kin, second = trial("second_eddy_path", 113.0, base=240.0), trial("sensor_lag", 118.0, base=240.0), trial("creep", left, base=113.0)
-    base = trial("none", 240.0).result
+    base, finer = trial("none", 240.0).result, trial("amplifier_lag", 117.0, base=240.0)
+    finer.result.choices = Choices(knots=(26, 18))
     state = Reached(base, [], {})
-    for best, good in ((first, [first, kin]), (second, [second])):
+    for best, good in ((first, [first, kin, finer]), (second, [second])):
         state.adopt(best, good)
 
     def exchanged(task, state, check):

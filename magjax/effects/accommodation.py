@@ -12,8 +12,7 @@ MEMORY = 0.15  # share of the mean magnetization taken over at a reversal
 class Accommodation(AbstractEffect):
     """At each reversal a running mean of M takes over a share of the present M; the relays' field is shifted by it.
 
-    In detail it takes over all along instead, by the path that M has gone: a pace of a half over half of what is between it and M on a path
-    of 1.4 M_s.
+    In detail it follows M all along instead, by the path that M goes: at a pace of 0.5 it makes up half of what it is behind on a path of 1.4 M_s.
     """
 
     shift: Float[Array, ""] = param(
