@@ -1,6 +1,7 @@
 """What a round of the search has chosen, before it is adopted: whether two serve better, and on which density and memory."""
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -72,13 +73,18 @@ def of_two(task, best, left, good, with_others=None):
     def beside(rival, second):
         return lambda say: to_the_end(task.on(progress=say), rival.result, second, excess_of(rival.result), useful)
 
+    def serves(rival, pair):
+        cost = (rival.parameters + pair.parameters - best.parameters) * of_one
+        return pair.physical and pair.result.chi2_per_sample < near and chi2_of(pair.result) + cost < least
+
     for _, rival, scores in sorted(ahead, key=lambda row: row[0]):
         seconds = [c for c in scores[:AHEAD] if abs(c.z) >= AS_HIGH * abs(scores[0].z)]  # at null one law scores about as its like
-        for pair in together([beside(rival, c) for c in seconds], task.progress):
-            cost = (rival.parameters + pair.parameters - best.parameters) * of_one
-            met = pair.physical and pair.result.chi2_per_sample < near
-            if met and chi2_of(pair.result) + cost < least:
-                return rival, scores
+        found = functools.partial(serves, rival)
+        pairs = together(
+            [beside(rival, c) for c in seconds], task.progress, lambda k, ended, found=found: k not in ended and any(map(found, ended.values()))
+        )
+        if any(pair is not None and found(pair) for pair in pairs):
+            return rival, scores
     return best, left
 
 

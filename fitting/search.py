@@ -54,7 +54,7 @@ class Reached:
     `form`: an effect in the current fit that was not adopted: it makes up for the form of the laws of those that were;
     `foretell`: what fits say of the check recordings; `under_way`: trials by name of a round that has not come to its end;
     `unsure`: the score that what that round finds must reach with what check recordings say for it, 0 where they need not;
-    `hidden`: names of effects adopted though nothing scored, for what check recordings say;
+    `exchanged`: the fit whose effects were tried for rivals in their places already; `hidden`: names of effects adopted though nothing scored, for what check recordings say;
     `late`: whether the time was over before the search was through; `partial`: whether what was reached stands on a round that
     did not come to its end.
     """
@@ -66,6 +66,7 @@ class Reached:
     foretell: Foreteller | None = None
     under_way: dict = dataclasses.field(default_factory=dict)
     unsure: float = 0.0
+    exchanged: object = None
     hidden: tuple = ()
     late: bool = False
     partial: bool = False
@@ -102,7 +103,8 @@ def _once_more(task, state, made_up, scored, check, ends):
     """What was adopted, once more beside what came later."""
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         backward(task, state, made_up)
-        exchange(task, state, check)
+        if state.current is not state.exchanged:
+            exchange(task, state, check)
         if commuted(task, state, scored.get("sensor_lag")):
             exchange(task, state, check)
     if state.steps and state.current is not state.steps[-1][0].result:
@@ -165,7 +167,9 @@ def _of_another_pair(task, base, state, candidates, check) -> list:
     """The scores beside the effects found: two that leave a misfit are exchanged for rivals where these leave less. Far from the noise
     the first one gives way to a rival with which one of its own leaders comes nearer, and the next round finds that one."""
     if MISFIT < state.current.chi2_per_sample < FAR_FROM_NOISE:
-        return screened(state.current, task.choices) if exchange(task, state, check) else candidates
+        changed = exchange(task, state, check)
+        state.exchanged = state.current
+        return screened(state.current, task.choices) if changed else candidates
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         return candidates
     first, _, good, _ = state.steps[0]

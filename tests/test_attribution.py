@@ -854,6 +854,12 @@ def test_a_wrong_pair_is_left_before_a_third_is_tried(monkeypatch, left, other, 
     assert found == (["screened"] if "transport_delay" in steps else ["of the other"] if steps == ["sensor_lag"] else ["given"])
     if steps == ["sensor_lag"]:
         assert state.current is kin.result and state.steps[0][3] is base
+    again = []
+    monkeypatch.setattr(fitting.search, "backward", lambda *a: None)
+    monkeypatch.setattr(fitting.search, "commuted", lambda *a: False)
+    monkeypatch.setattr(fitting.search, "exchange", lambda *a: again.append(1))
+    fitting.search._once_more(Task((), None), state, None, {}, (), lambda current: False)
+    assert len(again) == (left == 1.2)  # not twice beside the same fit, nor far from the noise
 
 
 @pytest.mark.parametrize(("before", "after", "whole"), [(1.5, 0.95, True), (1.2, 0.94, False), (1.5, 1.1, False), (2.9, 0.99, True)])
