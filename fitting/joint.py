@@ -33,6 +33,8 @@ AT_END = (
     5e-4,
 )  # Jacobians, the fall of half chi2 that they must bring (or this share of it), else nothing more is to be had
 PACE = 3, 6  # Jacobians over which the pace towards a target is taken, and after which
+MOVED = 4.0  # of chi2, by which the squared change of a misfit since it was last taken on the fine grid asks for that again
+UNLIKE = 2e-3, 1e-2  # share of half chi2, by which the fine grid may have it otherwise where a fit ends; of one far from the noise
 PROMISED = 1e-2  # share of half chi2 that may still be promised there: a kink, or the coarse Jacobian, keeps it
 
 
@@ -94,9 +96,9 @@ class Solution:
     interrupted: bool = False
 
 
-def data_residual(problem: Problem, z):
-    """Whitened misfit of the harmonics on the fine grid."""
-    return problem.passes.residual(z)
+def data_residual(problem: Problem, z, stride: int = 1):
+    """Whitened misfit of the harmonics on the fine grid; marched by every `stride`-th sample of it, see `Passes.residual`."""
+    return problem.passes.residual(z, stride)
 
 
 def fields(problem: Problem, z) -> list:
@@ -112,6 +114,62 @@ def data_jacobian(problem: Problem, z):
 def compiled(problem: Problem, z) -> None:
     """Compile what a fit from z needs, side by side."""
     together(problem.passes.compiling(z))
+
+
+class Corrected:
+    """A problem's misfit while it is solved: trial steps march the Jacobian's grid, and are told what the fine one had found beside it
+    where both were last taken: where the fit began or ended, and wherever it has moved by more than what is left.
+
+    Of a trial the march on the fine grid took most of the time, and by how much the two differ hardly depends on the unknowns.
+    """
+
+    def __init__(self, problem):
+        self.problem, self.stride = problem, problem.passes.stride
+        self.beyond, self.stale, self.seen, self.known = 0.0, False, None, (None, None)
+
+    def near(self, z) -> np.ndarray:
+        """The misfit as a trial step is told."""
+        return data_residual(self.problem, z, self.stride) + self.beyond
+
+    def exact(self, z, near=None) -> np.ndarray:
+        """The misfit on the fine grid, by which those nearby are corrected; `near`: as they had it there."""
+        found = data_residual(self.problem, z)
+        if self.stride > 1:
+            self.beyond = self.beyond + found - (self.near(z) if near is None else near)
+        self.stale, self.seen = False, found
+        return found
+
+    def jacobian(self, z) -> np.ndarray:
+        """Its derivative, that of the last step at hand."""
+        if self.known[0] is not z:
+            self.known = z, data_jacobian(self.problem, z)
+        return self.known[1]
+
+    def stepped(self, solver, z, posed, state):
+        """A step of a solver from z: (unknowns, state). Where the fine grid is asked, it falls there, too."""
+        new, then, _ = solver.step(lambda y, _: (self.near(y), None), z, None, posed, state, frozenset())
+        if self.stride == 1 or not (then.good or then.decrement > 1.0 + PROMISED * then.cost):
+            return new, then
+        self.stale = self.stale or then.good
+        if then.good:
+            if not np.sum((then.residual - self.seen) ** 2) > MOVED * then.chi2:
+                return new, then
+            right = self._right(new, then, posed, z)
+            if right.cost < state.cost:
+                return new, dataclasses.replace(right, gained=state.cost - right.cost)
+        residual = self.exact(z)  # once more, by the fine grid alone
+        state = dataclasses.replace(state, residual=residual, cost=cost_of(residual, z, posed["prior"]))
+        return solver.step(lambda y, _: (data_residual(self.problem, y), None), z, None, posed, state, frozenset())[:2]
+
+    def ended(self, z, state, posed):
+        """The state where a fit ends, as the fine grid has it."""
+        return self._right(z, state, posed, self.known[0]) if self.stale else state
+
+    def _right(self, z, state, posed, begun):
+        """A state after a step from `begun` to z, as the fine grid has it."""
+        residual = self.exact(z, state.residual)
+        gradient = state.gradient + self.jacobian(begun).T @ (residual - state.residual)
+        return dataclasses.replace(state, residual=residual, cost=cost_of(residual, z, posed["prior"]), gradient=gradient)
 
 
 @kept
@@ -176,12 +234,12 @@ def solve(
     """
     layout, count = problem.layout, problem.data_count
     evidence = evidence and problem.stiffness is None
-    solver = SteppedLevenbergMarquardt(layout.bounds)
+    solver, told = SteppedLevenbergMarquardt(layout.bounds), Corrected(problem)
     z, weights = np.asarray(z, float), np.asarray(weights, float)
-    posed = {"jacobian": lambda z: data_jacobian(problem, z), "prior": prior_matrix(problem, weights)}
+    posed = {"jacobian": told.jacobian, "prior": prior_matrix(problem, weights)}
 
     def residual_at(z, _):
-        return data_residual(problem, z), None
+        return told.near(z), None
 
     def weighed(z, state, new):
         """The state under other roughness weights."""
@@ -194,11 +252,12 @@ def solve(
         return chi2, lower, weighed(z, state, lower), [chi2], []
 
     begin, converged, interrupted, taken, held = time.perf_counter(), False, False, 0, np.inf
+    told.exact(z)
     state = solver.init(residual_at, z, None, posed, None, None, frozenset())
     path, gains = [state.chi2], []
     try:
         for taken in range(1, max_jacobians + 1):
-            z, state, _ = solver.step(residual_at, z, None, posed, state, frozenset())
+            z, state = told.stepped(solver, z, posed, state)
             gains.append(state.gained)
             chi2 = state.chi2
             if progress is not None:
@@ -230,10 +289,14 @@ def solve(
             if settled or not state.good:
                 converged = state.decrement < 1.0 + (PROMISED if stalled else 1e-3) * state.cost
                 if settled or not evidence or state.decrement < 1.0:
-                    break
+                    near, state = state, told.ended(z, state, posed)
+                    if abs(state.cost - near.cost) < max(AT_END[1], UNLIKE[far] * near.cost):
+                        break
+                    gains = []  # on the fine grid it has not ended
                 state = dataclasses.replace(state, damping=min(state.damping, 1e2))
     except KeyboardInterrupt:
         converged, interrupted = False, True
+    state = told.ended(z, state, posed)
     # under the weights that are returned: they may have moved after the last step
     normal = state.information + posed["prior"]
     seconds = time.perf_counter() - begin

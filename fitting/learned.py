@@ -39,6 +39,7 @@ MANY = 3  # effects in place of which a function that leaves no more is the bett
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 AS_MUCH, FORETOLD = 1.1, 0.5  # of the chi2 of effects on finer hats, and of what they miss check recordings by, that one may leave
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
+HARDLY, ALIKE = 1e3, 3.0  # chi2/N of recordings left out, from which the linear model says no more than its size: as good to this factor
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 BASE_LOSSES = {  # of the base, that act as a constant times a rate
     ("coil", "flux_rate"): ("coil.R_eddy", "coil.k_eddy", "effects.eddy_currents.k"),
@@ -206,15 +207,25 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
     if not try_all(chosen_places(places)) and not (target == np.inf and try_all(other_places(places, [t.place for t in tried]))):
         return None
     tried = [t for t in tried if np.isfinite(t.result.chi2_per_sample)]
-    near = 1 + 1.3 * (tried[0].left_out[1] - 1) + 0.1
-    # of those that serve as well, the one that the rest of the model hides least: another must be larger to be seen as much
-    best, *others = sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: -t.place.visibility)
+    best, *others = _as_good(tried)
     rivals = tuple(t.place for t in others)
     fits = tuple(
         (t.place, float(t.result.chi2_per_sample), float(t.left_out[1]) if np.isfinite(t.left_out[1]) else None) for t in tried
     )
     best = best if target < np.inf else _on_finer_hats(best, base, recordings, bench, progress)
     return dataclasses.replace(best, places=tuple(places), rivals=rivals, tried=fits)
+
+
+def _as_good(tried) -> list[Learned]:
+    """Of terms fitted, those that foretell recordings left out about as well as the first of them, the best one first: the one that the
+    rest of the model hides least, for another must be larger to be seen as much. Where that is hardly foretold at all, the one that
+    leaves least.
+    """
+    best = tried[0].left_out[1]
+    if best > HARDLY:
+        return sorted((t for t in tried if t.worth and t.left_out[1] < ALIKE * best), key=lambda t: t.result.chi2_per_sample)
+    near = 1 + 1.3 * (best - 1) + 0.1
+    return sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: -t.place.visibility)
 
 
 def _on_finer_hats(learned, base, recordings, bench, progress) -> Learned:

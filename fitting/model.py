@@ -17,7 +17,7 @@ from magjax.chain import Timeline
 from magjax.chain.coupled import KEPT_FIRST, KEPT_LAST
 from magjax.preisach import Preisach
 from magjax.programs import kept
-from magjax.simulate import driven_current, finish_chain, march_chain
+from magjax.simulate import driven_current, finish_chain, march_chain, march_period
 
 from .density import DensityBasis, Hats, everett_values, on_device
 
@@ -208,8 +208,7 @@ class Predictor(eqx.Module):
         def one(periods, drive, dt, level):
             shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
             line = Timeline(dt, drive.shape[0], True)
-            until = self.until if self.times is None else (None, self.times)
-            return march_chain(shifted, line, driven_current(actuator, drive, line), periods, self.corners, until=until)[:3]
+            return march_chain(shifted, line, driven_current(actuator, drive, line), periods, self.corners, until=self.until)[:3]
 
         order = np.asarray(self.index)
         levels = jnp.zeros(len(order)) if levels is None else levels
@@ -219,6 +218,17 @@ class Predictor(eqx.Module):
             parts.append(jax.vmap(functools.partial(one, periods))(drive, dt, levels[at : at + drive.shape[0]]))
             at += drive.shape[0]
         return tuple(parts)
+
+    def march_period(self, actuator, levels, times, stride):
+        """As `march` of one grid, three of (recordings, samples), with numbers that what is compiled does not know: in the last of `times`
+        periods, by every `stride`-th sample of it, 0 between."""
+
+        def one(drive, dt, level):
+            shifted = eqx.tree_at(lambda a: a.hysteresis.offset, actuator, actuator.hysteresis.offset + level)
+            line = Timeline(dt, drive.shape[0], True)
+            return march_period(shifted, line, driven_current(actuator, drive, line), times, self.corners, stride)
+
+        return jax.vmap(one)(self.drives[0], self.steps[0], levels)
 
     def batches(self):
         """The same in parts of whole `ROWS` recordings on one grid, the last repeated: yields (predictor, places of its recordings)."""
@@ -240,9 +250,9 @@ class Predictor(eqx.Module):
             return self
         return dataclasses.replace(self, periods=(KEPT_FIRST + KEPT_LAST,), times=np.asarray(periods))
 
-    def behind(self) -> "Predictor":
-        """The same for what is behind the march: it does not know how that went."""
-        return dataclasses.replace(self, periods=(1,) * len(self.periods), corners=0, until=None, times=None)
+    def behind(self, corners: int = 0) -> "Predictor":
+        """The same for what is behind the march, and does not know how that went; with `corners` for a `march_period`."""
+        return dataclasses.replace(self, periods=(1,) * len(self.periods), corners=corners, until=None, times=None)
 
     def lines_of_each(self, actuators, levels):
         """As `self(actuator, levels)` for several actuators, the leading axis of every array: (actuators, recordings, harmonics + 1).

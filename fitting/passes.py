@@ -40,8 +40,8 @@ class Point(eqx.Module):
 
 
 @kept
-def _march(template, names, point, predictor):
-    return predictor.march(point.actuator(template, names), point.levels)
+def _march(template, names, point, predictor, times, stride):
+    return predictor.march_period(point.actuator(template, names), point.levels, times, stride)
 
 
 @kept
@@ -64,17 +64,23 @@ class Passes:
         self.target = Target(*(np.asarray(getattr(problem.target, f.name)) for f in dataclasses.fields(Target)))
         self.order = np.asarray(problem.predictors[0].index)
 
-    def residual(self, z) -> np.ndarray:
-        """The whitened misfit on the fine grid."""
-        return whitened(self.lines(z, self.problem.predictors[1]), self.target, np)
+    def residual(self, z, stride: int = 1) -> np.ndarray:
+        """The whitened misfit on the fine grid, marched by every `stride`-th sample of it."""
+        return whitened(self.lines(z, self.problem.predictors[1], stride), self.target, np)
 
-    def lines(self, z, predictor) -> np.ndarray:
-        """The reading's coefficients by a predictor of the same recordings, (recordings, harmonics + 1)."""
+    @property
+    def stride(self) -> int:
+        """The most samples of the fine grid that a march may take at once and be no coarser than the Jacobian's."""
+        coarse, fine = (p.drives[0].shape[1] for p in self.problem.predictors)
+        return max(d for d in range(1, fine // coarse + 1) if fine % d == 0)
+
+    def lines(self, z, predictor, stride: int = 1) -> np.ndarray:
+        """The reading's coefficients by a predictor of the same recordings, (recordings, harmonics + 1); `stride` as of `residual`."""
         z = np.asarray(z, float)
         parameters = self.read.at(z)
         lines = [
             np.asarray(_read(self.read.actuator, self.read.names, parameters, part.behind(), marched))[: len(places)]
-            for part, places, marched in self._marched(z, predictor)
+            for part, places, marched in self._marched(z, predictor, stride)
         ]
         return np.concatenate(lines)[self.order]
 
@@ -147,10 +153,13 @@ class Passes:
     def _steps(self, point, z, part, places):
         return marched_steps(self.march.actuator, self.march.names, self._of(point, z, part, places), part.for_any())
 
-    def _marched(self, z, predictor):
+    def _marched(self, z, predictor, stride: int = 1):
+        """Yields (part of the predictor, places of its recordings, their last period as `Predictor.lines` asks for it)."""
         point = self._point(z)
         for part, places in predictor.batches():
-            yield part, places, _march(self.march.actuator, self.march.names, self._of(point, z, part, places), part.for_any())
+            own, numbers = self._of(point, z, part, places), (np.asarray(part.periods[0]), np.asarray(stride))
+            marched = _march(self.march.actuator, self.march.names, own, part.behind(part.corners), *numbers)
+            yield part, places, (tuple(_between(x, stride) for x in marched),)
 
     def _point(self, z) -> Point:
         n = self.problem.layout.density_unknowns
@@ -165,6 +174,17 @@ class Passes:
         if memories:
             levels[: len(places)] = MEMORY * self.total * z[len(z) - memories :][places]
         return dataclasses.replace(point, levels=levels)
+
+
+def _between(signals, stride: int):
+    """Signals of a period, (recordings, samples), of which every `stride`-th sample is known, at all of them: their Fourier series."""
+    if stride == 1:
+        return signals
+    known = np.asarray(signals)[:, ::stride]
+    series = np.fft.rfft(known)
+    if known.shape[1] % 2 == 0:
+        series[:, -1] *= 0.5  # the line at half the sampling stands for two
+    return stride * np.fft.irfft(series, signals.shape[1])
 
 
 class _Template:

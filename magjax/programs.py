@@ -212,13 +212,30 @@ def _write(path, content: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.write_bytes(content)
         partial.replace(path)
-        _make_room(path.parent)
+        if _WRITTEN.of(path.parent, len(content)):
+            _make_room(path.parent)
     except OSError:
         with contextlib.suppress(OSError):
             partial.unlink()
 
 
+class _Written(dict):
+    """Bytes written to each folder since room was made there."""
+
+    def of(self, folder, more: int) -> bool:
+        """Whether room is to be made once more: at first, and after a twentieth of what there is; to look at thousands of files takes its time."""
+        self[folder] = self.get(folder, MOST) + more
+        due = self[folder] > MOST / 20
+        if due:
+            self[folder] = 0
+        return due
+
+
+_WRITTEN = _Written()
+
+
 def _make_room(folder) -> None:
+    """Let those go that were used longest ago, until what is left takes less than MOST."""
     there = sorted((f.stat().st_mtime, f.stat().st_size, f) for f in folder.glob("*.program"))
     over = sum(size for _, size, _ in there) - MOST
     for _, size, path in there:

@@ -102,6 +102,8 @@ def test_a_prior_of_a_law_is_about_its_null_wherever_a_fit_begins(recordings, be
     problem, z = build_problem(spectra, actuator, stated, names, Choices(rest="negative"))  # the bench's word comes first
     assert z[k] == 0 and float(problem.target.priors[k - problem.layout.density_unknowns - 1]) == pytest.approx(0.01 / 0.5)
 
+ONE_GRID = SimpleNamespace(stride=1)
+
 
 @pytest.mark.parametrize(("stroke", "frequency", "told"), [(6e-5, 10.0, False), (9e-5, 10.0, True), (9e-5, 300.0, False)])
 def test_a_reading_beyond_the_rod_is_told(bench, stroke, frequency, told):
@@ -775,10 +777,10 @@ def test_parameters_stay_between_their_bounds(monkeypatch):
     assert layout.bounds[1] == pytest.approx([np.inf, np.inf, 2, 3, np.inf, np.inf])
     wanted = np.array([9.0, 0.0, 6.0, -20.0, 0.7, -3.0])
     mixed = np.eye(6) + 0.1
-    monkeypatch.setattr(joint, "data_residual", lambda problem, z: 10 * mixed @ (np.asarray(z) - wanted))
+    monkeypatch.setattr(joint, "data_residual", lambda problem, z, stride=1: 10 * mixed @ (np.asarray(z) - wanted))
     monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: 10 * mixed)
     monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(6))
-    found = joint.solve(SimpleNamespace(layout=layout, data_count=6), np.zeros(6), np.ones(0), evidence=False)
+    found = joint.solve(SimpleNamespace(layout=layout, data_count=6, passes=ONE_GRID), np.zeros(6), np.ones(0), evidence=False)
     assert [float(layout.value(name, found.z)) for name in "ab"] == pytest.approx([1.0, -0.5])
     assert list(layout.inside(found.z)) == [True, True, False, False, True, True] and found.converged
 
@@ -790,16 +792,65 @@ def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
 
     kinked = lambda z: np.concatenate([10.0 * (z - 1.0), 40.0 + 6.0 * np.abs(z)])  # noqa: E731
     sloped = lambda z: np.concatenate([10.0 * np.eye(2), 6.0 * np.eye(2)])  # noqa: E731  one side's, on both
-    monkeypatch.setattr(joint, "data_residual", lambda problem, z: kinked(np.asarray(z)))
+    monkeypatch.setattr(joint, "data_residual", lambda problem, z, stride=1: kinked(np.asarray(z)))
     monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: sloped(z))
     monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(2))
     monkeypatch.setattr(solver, "bent_step", lambda residual_at, bounds, y, new, *rest: new)
     monkeypatch.setattr(joint, "evidence_weights", lambda layout, penalties, z, normal, weights: weights)
     monkeypatch.setattr(joint, "AT_END", most)
     layout = SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf)))
-    problem = SimpleNamespace(layout=layout, penalties=(), stiffness=None, data_count=1000)
+    problem = SimpleNamespace(layout=layout, penalties=(), stiffness=None, data_count=1000, passes=ONE_GRID)
     found = joint.solve(problem, np.asarray([2.0, 0.5]), np.ones(1))
     assert found.jacobians < 12 if most[0] == 4 else found.jacobians == 30
+
+
+def two_grids(monkeypatch, off):
+    """A curved problem whose coarse grid has its misfit otherwise by `off(z)`: how often each grid was asked, and the solution."""
+    from fitting import joint
+
+    rng = np.random.default_rng(4)
+    mixed, measured = rng.normal(size=(12, 3)), 30.0 * rng.normal(size=12)
+    asked = {1: 0, 4: 0}
+
+    def misfit(problem, z, stride=1):
+        asked[stride] += 1
+        z = np.asarray(z)
+        return 40.0 * mixed @ np.sinh(z) - measured + (0.0 if stride == 1 else off(z))
+
+    monkeypatch.setattr(joint, "data_residual", misfit)
+    monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: 40.0 * mixed * np.cosh(z))
+    monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(3))
+    layout = SimpleNamespace(bounds=(np.full(3, -np.inf), np.full(3, np.inf)))
+
+    def solved(stride):
+        asked.update({1: 0, 4: 0})
+        problem = SimpleNamespace(layout=layout, data_count=12, passes=SimpleNamespace(stride=stride))
+        return joint.solve(problem, np.full(3, 2.0), np.ones(0), evidence=False), dict(asked)
+
+    return solved
+
+
+def test_trial_steps_go_by_a_coarser_grid_and_end_where_the_fine_one_does(monkeypatch):
+    shape = 5.0 * np.random.default_rng(5).normal(size=12)
+    solved = two_grids(monkeypatch, lambda z: shape * (1 + 0.1 * np.tanh(z[0])))
+    (fine, alone), (both, few) = solved(1), solved(4)
+    assert fine.converged and both.converged and both.z == pytest.approx(fine.z, abs=2e-3)
+    assert both.chi2 == pytest.approx(fine.chi2, rel=1e-3) and both.chi2 > 100  # a misfit is left
+    assert both.chi2 == pytest.approx(float(np.sum(joint_misfit(both.z) ** 2)), rel=1e-12)  # as the fine grid has it
+    assert few[1] < alone[1] / 2 and few[4] > few[1]
+
+
+def joint_misfit(z):
+    from fitting import joint
+
+    return joint.data_residual(None, z)
+
+
+def test_a_step_that_falls_on_the_coarse_grid_alone_is_taken_on_the_fine_one(monkeypatch):
+    """The coarse grid has a valley of its own beside the way."""
+    solved = two_grids(monkeypatch, lambda z: 4000.0 * (z[0] - 1.9))
+    (fine, _), (both, _) = solved(1), solved(4)
+    assert both.converged and both.chi2 == pytest.approx(fine.chi2, rel=2e-3) and both.z == pytest.approx(fine.z, abs=2e-2)
 
 
 def test_an_iteration_that_is_too_slow_for_its_target_ends():

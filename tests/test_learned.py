@@ -300,6 +300,22 @@ def test_finer_hats_beside_a_term_must_take_half_of_what_is_left(monkeypatch):
     assert found.result.choices.knots == (18, 13) and found.result.chi2_per_sample == 6.5
 
 
+@pytest.mark.parametrize(("scale", "chosen"), [(1.0, "field"), (1e4, "magnetization")])
+def test_where_recordings_left_out_are_hardly_foretold_what_leaves_least_is_learned(monkeypatch, scale, chosen):
+    fits = {"magnetization": (200.0, 26.8), "field": (120.0, 29.2)}
+    places = [placed("coil", (name, "times_flux_rate"), evidence) for name, evidence in (("magnetization", 393.0), ("field", 357.0))]
+    monkeypatch.setattr(learned_module, "chosen_places", lambda places: places)
+    monkeypatch.setattr(learned_module, "locate_places", lambda *a: places)
+    monkeypatch.setattr(learned_module, "_on_finer_hats", lambda best, *a: best)
+
+    def fit_term(base, place, *more, choices=None):
+        after, leaves = fits[place.variables[0]]
+        return dataclasses.replace(learned_of(place, scale * after, leaves), left_out=(scale * 1e4, scale * after))
+
+    monkeypatch.setattr(learned_module, "fit_term", fit_term)
+    assert learned_module.learn(None, (), None).place.variables[0] == chosen
+
+
 @pytest.mark.parametrize("late", ["another place", "finer hats"])
 def test_what_was_learned_when_the_time_is_over_is_kept(monkeypatch, late):
     coil, source = placed("coil", ("flux_rate",), 768.0), placed("source", ("current_rate",), 760.0)

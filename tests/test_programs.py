@@ -160,6 +160,15 @@ def test_nothing_is_kept_without_a_folder_or_without_room(folder, monkeypatch):
     assert np.allclose(scaled(line, values, 7.0)[0][0], 3.5 * np.arange(6)) and TRACED == [5.0, 6.0, 7.0]
 
 
+def test_the_folder_is_looked_through_now_and_then(folder, monkeypatch):
+    looked = []
+    monkeypatch.setattr(programs, "_make_room", looked.append)
+    monkeypatch.setattr(programs, "MOST", 2000)
+    for k in range(7):
+        programs._write(folder / f"{k}.program", b"x" * 40)
+    assert looked == [folder] * 3 and len(list(folder.glob("*.program"))) == 7  # the first, the fourth and the seventh
+
+
 @pytest.mark.parametrize(("heavy", "at_once"), [(True, 1), (False, 3)])
 def test_heavy_programs_are_compiled_one_at_a_time(monkeypatch, folder, heavy, at_once):
     """Two side by side took 2.4 GB, one after the other 1.2."""

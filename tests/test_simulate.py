@@ -8,16 +8,17 @@ import pytest
 
 from magjax.actuator import Actuator
 from magjax.bench import load_bench
-from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics
+from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics, Timeline
 from magjax.chain.loops import tied
 from magjax.chain.march import _march_all, _marched
 from magjax.effects.excess_loss import ExcessLoss
+from magjax.effects.field_diffusion import FieldDiffusion
 from magjax.effects.magnetic_aftereffect import MagneticAftereffect
 from magjax.effects.stress_feedback import StressFeedback
 from magjax.errors import ConfigurationError
 from magjax.preisach import Preisach, gaussian_lorentzian_masses
 from magjax.preisach.memory import apply_field
-from magjax.simulate import run_chain, simulate, sweep
+from magjax.simulate import march_chain, march_period, run_chain, simulate, sweep
 from tests.oracle.slow import SlowPreisach, slow_trapezoid
 
 LOW, HIGH, M_S = -2500.0, 2.7e4, 7.87e5
@@ -128,6 +129,28 @@ def test_the_replay_has_the_derivatives_of_the_march(scheme, effects):
         assert np.asarray(values) == pytest.approx(np.asarray(value), abs=1e-7)
         assert np.asarray(changes) == pytest.approx(np.asarray(change), rel=1e-9, abs=1e-9 * float(jnp.abs(change).max()) + 1e-9)
     assert float(jnp.abs(direct[1][0]).max()) > 1.0
+
+
+@pytest.mark.parametrize("effects", [(), (MagneticAftereffect(share=0.2),), (FieldDiffusion(kappa=0.5),)], ids=len)
+@pytest.mark.parametrize(("times", "stride"), [(2, 1), (3, 4), (9, 4)])
+def test_a_period_by_every_so_many_samples_is_that_of_the_coarser_drive(effects, times, stride):
+    """How often it is marched and by how many samples is no number for the compiler."""
+    act = actuator(12)
+    for effect in effects:
+        act = act.with_effect(effect)
+    wave, h = jnp.asarray(sine(96, 0.5, -0.1)), 2e-4
+    found = march_period_compiled(act, wave, h, np.asarray(times), np.asarray(stride))
+    few = wave[::stride]
+    expected = jax.jit(lambda a, x: march_chain(a, Timeline(stride * h, len(x), True), x, times, 4)[:3])(act, few)
+    for row, value in zip(found, expected, strict=True):
+        assert np.asarray(row)[::stride] == pytest.approx(np.asarray(value), rel=1e-10, abs=1e-7)
+    H = np.asarray(found[0])
+    assert len(H) == 96 and np.count_nonzero(H) == 96 // stride
+
+
+@eqx.filter_jit
+def march_period_compiled(act, wave, h, times, stride):
+    return march_period(act, Timeline(h, len(wave), True), wave, times, 4, stride)
 
 
 def test_gradient_in_the_masses():

@@ -181,6 +181,33 @@ def run_many(march: March, applied, current, times):
     return jax.tree.map(lambda x: jnp.reshape(x, (kept * count, *x.shape[2:])), rows)
 
 
+def run_last(march: March, applied, current, times, stride):
+    """The last of `times` repetitions of a period, every `stride`-th sample of it alone: numbers that what is compiled does not know.
+
+    `applied`, `current`: one period, (period,), of which `stride` is a divisor; `march`: with the step and the `period` of what is marched.
+    Returns field H, magnetization M and its spread, (period,) each, 0 between the samples marched; the highest and the lowest relay field.
+    Not for derivatives.
+    """
+    size = len(applied)
+    count = size // stride
+
+    def again(k, state):
+        carry, rows, highest, lowest = state
+        j = (k + 1) % count
+        place = j * stride
+        carry, (H, M, spread, v, _) = march.advance(carry, (applied[place], current[place], j == 0))
+        last = k + 1 == times * count  # the first sample of a period that would follow
+        rows = tuple(x.at[place].set(jnp.where(last, x[place], new)) for x, new in zip(rows, (H, M, spread), strict=True))
+        begins = j == 1
+        highest, lowest = jnp.where(begins, v, jnp.maximum(highest, v)), jnp.where(begins, v, jnp.minimum(lowest, v))
+        return carry, rows, highest, lowest
+
+    v = jnp.mean(march.first[3])
+    start = tied((march.carry, (jnp.zeros(size),) * 3, v, v), applied)
+    _, *found = jax.lax.fori_loop(0, times * count, again, start)
+    return found
+
+
 def run_until_steady(march: March, applied, current, tolerance, most):
     """The last of so many repetitions of a period that the next would be the same, from its second sample to its first.
 
