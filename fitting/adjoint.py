@@ -26,7 +26,7 @@ from .starts import unreached_row
 class Marched(eqx.Module):
     """Marches to first order, of all recordings of a predictor with one grid: (recordings, ...) each.
 
-    `field`, `magnetization`, `spread`: (samples,), of the last period; `drive`: (2, samples, parameters), of applied field and current by
+    `field`, `magnetization`, `spread`: (samples,), of the last period, `current`: A, in the coil; `drive`: (2, samples, parameters), of applied field and current by
     the parameters, the last of which is the sum of the masses, relative, as effects read it; `gain`: of the applied field by the
     current; `unreached`: (2,), of M by the highest and the lowest relay field of the last period.
     """
@@ -35,6 +35,7 @@ class Marched(eqx.Module):
     field: jax.Array
     magnetization: jax.Array
     spread: jax.Array
+    current: jax.Array
     drive: jax.Array
     gain: jax.Array
     unreached: jax.Array
@@ -66,7 +67,7 @@ def marched_steps(template, names, point, predictor) -> Marched:
         ends = jnp.max(relay), jnp.min(relay)
         H, M, spread = (x[-count - 1 : -1] for x in (steps.field, steps.magnetization, steps.spread))
         return Marched(
-            steps, H, M + actuator.hysteresis.unreached(*ends), spread, jax.jacfwd(driven)(parameters),
+            steps, H, M + actuator.hysteresis.unreached(*ends), spread, current, jax.jacfwd(driven)(parameters),
             jax.jacfwd(actuator.coil.applied_field)(current[0]), jnp.stack(jax.jacfwd(actuator.hysteresis.unreached, (0, 1))(*ends)),
         )  # fmt: skip
 
@@ -126,7 +127,7 @@ class Rows:
 
     `marched`: of the same recordings, in NumPy, without the slopes of its steps; `signals`: (7, samples), see `SIGNALS`; `read`:
     (parameters,), of those behind the march; `stored`: the samples of what is stored of the march at the ends of its steps, as all that follow
-    (`ends_taken`), and `taken`: those of the whole march; `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom
+    (`ends_taken`); `own`: (steps, shells), of what is added to M of the relays, and stays; `known`: (older places,), the same of the bottom
     of the plane, with all that rests on it, of the maxima and of the minima of the memory; `drive`: (samples, 2), of applied field and
     current on the way into the march; `disturbed`: (steps, 3), of what is added to the steps, see `magnetize`; `moving`:
     (parameters,), of those of the march; `mean`: (), of what is added to M of all samples.
@@ -136,7 +137,6 @@ class Rows:
     signals: np.ndarray
     read: np.ndarray
     stored: np.ndarray
-    taken: np.ndarray
     own: np.ndarray
     known: np.ndarray
     drive: np.ndarray
@@ -165,9 +165,16 @@ class Rows:
         return self.moving + np.einsum("rlnk,rknp->rlp", self.drive, self.marched.drive, optimize=True)
 
     def of_steps(self, *added) -> np.ndarray:
-        """First-order change of the lines by what is added to every step, 3 of (columns, recordings, steps + 1) as `magnetize` has them, or
-        None: (columns, recordings, lines)."""
-        return sum(np.einsum("rlt,crt->crl", self.disturbed[..., k], x[:, :, self.taken], optimize=True) for k, x in enumerate(added) if x is not None)
+        """First-order change of the lines by what is added to every step of `path`, 3 of (columns, recordings, steps + 1) as `magnetize`
+        has them, or None: (columns, recordings, lines)."""
+        return sum(np.einsum("rlt,crt->crl", self.disturbed[..., k], x[:, :, self.stored], optimize=True) for k, x in enumerate(added) if x is not None)
+
+    def path(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Relay field and magnetization, A/m, and current, A, over the march, of a long one its first and last periods: (recordings, steps + 1)
+        each; of a rod in shells their mean."""
+        steps, current = self.marched.steps, self.marched.current
+        periods = (steps.magnetization.shape[1] - 1) // current.shape[1]
+        return steps.relay_field.mean(axis=2), steps.magnetization, np.concatenate([np.tile(current, periods), current[:, :1]], axis=1)
 
     def of_drive(self, change) -> np.ndarray:
         """The same by a change of the current, A, (columns, recordings, samples)."""
@@ -235,4 +242,4 @@ def _gathered(back: Backward, passed, signals, read) -> Rows:
     moving = (sum(p.parameters for p in passed) + first[:, shells + 2 :]).swapaxes(1, 2)
     mean = signals[:, :, 1].sum(axis=-1)
     marched = dataclasses.replace(back.marched, steps=dataclasses.replace(steps, slopes=None))  # the large part of it has served
-    return Rows(marched, signals, read, back.stored, back.taken, own, known[..., : older - 1], drive, disturbed, moving, mean)
+    return Rows(marched, signals, read, back.stored, own, known[..., : older - 1], drive, disturbed, moving, mean)

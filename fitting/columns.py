@@ -11,8 +11,7 @@ import numpy as np
 
 from magjax.chain import Timeline
 from magjax.chain.coupled import disturbance_of
-from magjax.chain.march import magnetize
-from magjax.programs import seldom
+from magjax.programs import often, seldom
 from magjax.simulate import driven_current, finish_chain
 
 
@@ -27,28 +26,16 @@ def bare(actuator):
 
 
 @seldom
-def trajectory(predictor, actuator):
-    """The march of every recording, per grid: (field, magnetization, its spread) of the last period, (recordings, samples), and (relay field,
-    magnetization, coil current, step) of all periods, (recordings, time)."""
-
-    def one(periods, drive, dt):
-        current = driven_current(actuator, drive, Timeline(dt, drive.shape[0], True))
-        memory = actuator.hysteresis.memory(actuator.hysteresis.table(), predictor.corners)
-        whole = [jnp.append(jnp.tile(x, periods), x[:1]) for x in (actuator.coil.applied_field(current), current)]
-        count = len(current)
-        H, M, spread, v, _, _ = magnetize(actuator, *whole, dt, memory, actuator.coil.scheme, period=count)
-        unreached = actuator.hysteresis.unreached(jnp.max(v[-count:]), jnp.min(v[-count:]))
-        last = slice(-count - 1, -1)
-        return (H[last], M[last] + unreached, spread[last]), (v, M, whole[1], dt)
-
-    rows = [jax.vmap(functools.partial(one, n))(d, t) for d, t, n in zip(predictor.drives, predictor.steps, predictor.periods, strict=True)]
-    return [row[0] for row in rows], [row[1] for row in rows]
+def last_period(predictor, actuator, levels, times):
+    """Field, magnetization and its spread of the last of `times` periods of the recordings of one grid, (recordings, samples) each;
+    `levels`: of their M, A/m."""
+    return predictor.march_period(actuator, levels, times, 1)
 
 
-@seldom
+@often
 def in_step_change(effect, predictor, actuator, path, finite: bool):
-    """What an effect adds to every step along a `trajectory`, 3 of (recordings, time) per grid: its derivative at null, or, `finite`,
-    all of it."""
+    """What an effect adds to every step along a path, (relay field, magnetization, current, step) of (recordings, time) each and (recordings,),
+    of the predictor's periods on one grid, 3 of (recordings, time): its derivative at null, or, `finite`, all of it."""
 
     def one(periods, v, M, current, dt):
         def of(effect):
@@ -58,10 +45,10 @@ def in_step_change(effect, predictor, actuator, path, finite: bool):
             return of(effect)
         return jax.jvp(lambda a: of(effect.with_amplitude(a)), (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
 
-    return tuple(jax.vmap(functools.partial(one, n))(*part) for part, n in zip(path, predictor.periods, strict=True))
+    return jax.vmap(functools.partial(one, *predictor.periods))(*path)
 
 
-@seldom
+@often
 def drive_change(effect, predictor, actuator):
     """d drive / d amplitude of a source effect at null, per grid, (recordings, samples)."""
 
@@ -89,7 +76,7 @@ def lines_of(predictor, signals) -> np.ndarray:
     return np.concatenate(rows)[np.asarray(predictor.index)]
 
 
-@seldom
+@often
 def late_change(effects, predictor, actuator, signals):
     """d (free displacement, displacement, reading) / d amplitude of an effect behind the hysteresis at null, where it acts, per grid,
     (shapes, recordings, samples) each. `effects`: one with its shapes stacked; `signals`: of `signals_of`."""

@@ -1,7 +1,7 @@
 """The joint fit: all recordings at once, every free parameter, to the noise.
 
 Harmonics in, the steps of a bounded Levenberg-Marquardt solver behind optimistix's interface, roughness weights by
-evidence (MacKay) between them, the residual on a finer grid than the Jacobian.
+evidence (MacKay) between them, the residual on a finer grid than the Jacobian, by whose grid trial steps go.
 """
 
 import dataclasses

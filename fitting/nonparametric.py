@@ -20,7 +20,6 @@ from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
 from .adjoint import SIGNALS, as_lines
-from .columns import marching, trajectory
 from .model import whitened
 from .screen import Projector
 
@@ -165,8 +164,7 @@ class Tangents:
         self.target = dataclasses.replace(passes.target, lines=np.zeros_like(passes.target.lines))
         self.rows, self.marched = [], []
         for part, places, rows in passes.rows(z):
-            path = trajectory(part, marching(self.actuator))[1][0]
-            self.marched.append(_step_signals(self.actuator.coil.scheme, *(np.asarray(x)[: len(places)] for x in path)))
+            self.marched.append(_step_signals(self.actuator.coil.scheme, *rows.path(), np.asarray(part.steps[0])[: len(places)]))
             self.rows.append(rows)
         self.parts = list(self.fine.batches())
         self.read = []

@@ -63,16 +63,13 @@ class Passes:
         self.total, self.held = float(layout.total), None if layout.held is None else float(np.sum(layout.held))
         self.target = Target(*(np.asarray(getattr(problem.target, f.name)) for f in dataclasses.fields(Target)))
         self.order = np.asarray(problem.predictors[0].index)
+        coarse, fine = (p.drives[0].shape[1] for p in problem.predictors)
+        # the most samples of the fine grid that a march may take at once and be no coarser than the Jacobian's
+        self.stride = max(d for d in range(1, max(fine // coarse, 1) + 1) if fine % d == 0)
 
     def residual(self, z, stride: int = 1) -> np.ndarray:
         """The whitened misfit on the fine grid, marched by every `stride`-th sample of it."""
         return whitened(self.lines(z, self.problem.predictors[1], stride), self.target, np)
-
-    @property
-    def stride(self) -> int:
-        """The most samples of the fine grid that a march may take at once and be no coarser than the Jacobian's."""
-        coarse, fine = (p.drives[0].shape[1] for p in self.problem.predictors)
-        return max(d for d in range(1, fine // coarse + 1) if fine % d == 0)
 
     def lines(self, z, predictor, stride: int = 1) -> np.ndarray:
         """The reading's coefficients by a predictor of the same recordings, (recordings, harmonics + 1); `stride` as of `residual`."""

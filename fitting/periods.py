@@ -46,7 +46,7 @@ class Backward:
         self.marks = slice(self.size - marks, self.size)  # states of effects, of which the end of a later period asks
         total = steps.relay_field.shape[1] - 1
         periods = int(steps.periods[0])  # some of which may not be stored
-        self.stored, self.taken = ends_taken(total + 1, samples), ends_taken(periods * samples + 1, samples)
+        self.stored = ends_taken(total + 1, samples)
         self.before, self.place, self.turned = periods - self.count // samples, steps.place, np.zeros((self.number, 0), int)
         self.first = AT_FIRST * samples if self.before else 0  # steps that are gone through by themselves
         if self.before:

@@ -17,7 +17,7 @@ from magjax.constants import MU0
 from magjax.effects import CATALOGUE
 
 from .adjoint import as_lines
-from .columns import bare, drive_change, in_step_change, late_change, lines_of, marching, signals_of, trajectory
+from .columns import bare, drive_change, in_step_change, last_period, late_change, lines_of, marching, signals_of
 from .joint import data_jacobian, data_residual
 from .model import whitened
 from .spectra import reading_range
@@ -127,14 +127,14 @@ def _before(classes, trials, predictor, own, path, rows):
     """(class, shapes) of all that act before the magnetostriction, and the change of the lines, (columns, recordings, lines).
 
     `trials`: finite amplitudes of the classes that have no derivative at null; `own`: the actuator with the effects that march;
-    `path`: its trajectory; `rows`: what lines ask."""
+    `path`: of its march; `rows`: what lines ask."""
     plain, number, found = bare(own), len(rows.mean), {}
     for c in classes:
         if c.shells or not (c.in_step or c.block == "source"):
             continue
         for shapes in trials[c] or shape_grid(c):
             if c.in_step:
-                (change,) = in_step_change(c(**shapes), predictor, plain, path, c.amplitude in shapes)
+                change = in_step_change(c(**shapes), predictor, plain, path, c.amplitude in shapes)
                 found.setdefault(True, []).append(((c, shapes), [np.asarray(x)[:number] for x in change]))
             else:
                 (change,) = drive_change(c(**shapes), predictor.behind(), plain)
@@ -144,11 +144,14 @@ def _before(classes, trials, predictor, own, path, rows):
     return [asked for kind in (True, False) for asked, _ in found.get(kind, ())], lines
 
 
-def _changes(classes, trials, predictor, actuator, rows, readings):
+def _changes(classes, trials, predictor, actuator, rows, readings, levels):
     """(class, shapes) of every effect, and the first-order change of the lines of the predictor's recordings, (columns, recordings,
     harmonics + 1)."""
-    own, number = marching(actuator), len(rows.mean)
-    fields, path = trajectory(predictor, own)
+    own, number, every = marching(actuator), len(rows.mean), len(predictor.index)
+    fields = [[_filled(x, every) for x in (rows.marched.field, rows.marched.magnetization, rows.marched.spread)]]
+    path = (*(_filled(x, every) for x in rows.path()), predictor.steps[0])
+    times = np.asarray(predictor.periods[0])
+    predictor = dataclasses.replace(predictor, periods=((path[0].shape[1] - 1) // rows.signals.shape[3],))  # those that the path has
     signals = signals_of(predictor.behind(), actuator, fields)
     behind, late = _behind(classes, predictor, bare(actuator), signals, readings)
     before, lines = _before(classes, trials, predictor, own, path, rows)
@@ -158,11 +161,16 @@ def _changes(classes, trials, predictor, actuator, rows, readings):
     lines = [as_lines(x) for x in lines]
     for c in classes:
         for shapes in trials[c] if c.shells else ():
-            other, _ = trajectory(predictor, own.with_effect(c(**shapes)))
-            change = lines_of(predictor, signals_of(predictor.behind(), actuator, other)) - lines_of(predictor, signals)
+            other = last_period(predictor.behind(predictor.corners), own.with_effect(c(**shapes)), _filled(levels, every), times)
+            change = lines_of(predictor, signals_of(predictor.behind(), actuator, [other])) - lines_of(predictor, signals)
             lines.append(change[None, :number])
             asked.append((c, shapes))
     return asked, np.concatenate(lines)
+
+
+def _filled(rows, every: int) -> np.ndarray:
+    """The last row repeated, as in `Predictor.batches`."""
+    return np.asarray(rows)[np.minimum(np.arange(every), len(rows) - 1)]
 
 
 def columns(problem, z):
@@ -174,8 +182,10 @@ def columns(problem, z):
     fluxes = [MU0 * (h + m) for h, m in zip(H, M, strict=True)]
     steps = [1 / (s.frequency * len(drive)) for s, drive in zip(problem.spectra, drives, strict=True)]
     trials, lines = {c: c.finite_trials(drives, fluxes, steps) for c in classes}, []
-    for part, _, rows in problem.passes.rows(z):
-        asked, found = _changes(classes, trials, part, actuator, rows, reading_range(problem.spectra))
+    levels = problem.layout.levels(np.asarray(z))
+    levels = np.zeros(len(problem.spectra)) if levels is None else np.asarray(levels)
+    for part, places, rows in problem.passes.rows(z):
+        asked, found = _changes(classes, trials, part, actuator, rows, reading_range(problem.spectra), levels[places])
         lines.append(found)
     lines = np.concatenate(lines, axis=1)[:, np.asarray(predictor.index)]
     still = dataclasses.replace(problem.passes.target, lines=np.zeros_like(problem.passes.target.lines))

@@ -27,21 +27,22 @@ import numpy as np
 
 MOST = 300_000_000  # bytes on disk; beyond, those that were used longest ago go
 OWN = ("magjax", "fitting")
-IN_MEMORY: list[dict] = []  # the programs of every function
+IN_MEMORY: list[tuple] = []  # the programs of every function, and whether they last
 COMPILING = threading.RLock()  # one heavy program at a time: to compile it takes up to a gigabyte
 COMPILER = {"xla_cpu_use_fusion_emitters": False}  # with them a program takes twice as long to compile, and runs no faster
 HASTY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # a third of the time to compile
 HEAVY = 77_000  # bytes of what is compiled, more than the plain chain's programs have
 
 
-def kept(function, hasty: bool = False):
+def kept(function, hasty: bool = False, lasting: bool = False):
     """As `equinox.filter_jit`, for a function of modules, arrays and constants that returns arrays in tuples, lists, dicts and modules.
 
-    `hasty`: compiled without optimizing, for what runs a few times.
+    `hasty`: compiled without optimizing, for what runs a few times. `lasting`: small, and asked for again and again: stays in memory
+    where others are let go.
     """
     within, known, locks = eqx.filter_jit(function), {}, {}
     alone = functools.cache(lambda: eqx.filter_jit(function, compiler_options=compiler_options(hasty)))
-    IN_MEMORY.append(known)
+    IN_MEMORY.append((known, lasting))
 
     @functools.wraps(function)
     def call(*arguments):
@@ -71,6 +72,7 @@ def kept(function, hasty: bool = False):
 
 
 seldom = functools.partial(kept, hasty=True)
+often = functools.partial(kept, hasty=True, lasting=True)
 
 
 @functools.cache
@@ -84,11 +86,14 @@ def compiler_options(hasty: bool = False) -> dict:
     return known
 
 
-def forget(wanted=lambda kinds: False) -> None:
-    """Drop programs from memory, but those that are `wanted`, by the classes of their modules; they are read again where they are asked for."""
-    for known in IN_MEMORY:
+def forget(wanted=None) -> None:
+    """Drop programs from memory, but lasting ones and those that are `wanted`, by the classes of their modules, or all of them; they are
+    read again where they are asked for."""
+    for known, lasting in IN_MEMORY:
+        if wanted is not None and lasting:
+            continue
         for key, program in tuple(known.items()):
-            if not (program and wanted(program.kinds)):
+            if not (program and wanted is not None and wanted(program.kinds)):
                 known.pop(key, None)
 
 

@@ -15,6 +15,7 @@ from fitting.screen import columns
 from fitting.setup import Choices, build_problem, effect_parameters, free_parameters, spectra_of
 from magjax import programs
 from magjax.bench import load_bench
+from magjax.chain.march import magnetize
 from magjax.recording import Recording
 
 SMALL = Choices(fine=128, coarse=90, knots=(16, 12), level=24, rest="negative")
@@ -189,7 +190,7 @@ def test_nor_does_its_screening(traced, monkeypatch):
     few, more = problem_of(some(20, 200)), problem_of(some(30, 70, 150), knots=(8, 6))
     traced.clear()
     found = columns(*few)
-    assert {"trajectory", "late_change", "in_step_change", "drive_change"} <= set(traced) and len(found) >= len(kinds)
+    assert {"late_change", "in_step_change", "drive_change"} <= set(traced) and len(found) >= len(kinds)
     traced.clear()
     again = columns(*more)
     assert traced == [] and [row[:2] for row in again] == [row[:2] for row in found]
@@ -210,15 +211,28 @@ def test_marches_of_many_periods_share_their_programs(traced):
     actuator = layout.actuator(problem.template, z)
     assert slopes.shape == (len(found), len(z))
     assert found == pytest.approx(np.asarray(whitened(predicted_lines(fine, actuator), problem.target)), rel=1e-9, abs=1e-9)
-    for M, (M_all, drive, dt) in zip(problem.passes.magnetizations(z), marched_whole(coarse, actuator), strict=True):
+    whole = marched_whole(coarse, actuator)
+    for M, (_, M_all, _) in zip(problem.passes.magnetizations(z), whole, strict=True):
         M_all = np.asarray(M_all)[1:].reshape(14, -1)
         assert M.shape == (5, M_all.shape[1])
         assert M == pytest.approx(np.concatenate([M_all[:2], M_all[-3:]]), rel=1e-9)
+    (_, _, rows), *_ = problem.passes.rows(z)
+    for found, expected in zip(zip(*rows.path(), strict=True), whole, strict=True):  # what is screened along, of the same periods
+        for row, every in zip(found, expected, strict=True):
+            every = np.append(every[:1], every[1:].reshape(14, -1)[[0, 1, 11, 12, 13]])
+            assert row == pytest.approx(every, rel=1e-9)
 
 
 def marched_whole(predictor, actuator):
-    """M of every sample of all periods."""
-    from fitting.columns import trajectory
+    """Relay field, M and current of every sample of all periods."""
+    (periods,) = predictor.periods
 
-    (path,) = trajectory(predictor, actuator)[1]
-    return [tuple(np.asarray(x)[k] for x in path[1:]) for k in range(len(path[0]))]
+    @jax.jit
+    def one(actuator, drive, dt):
+        whole = jnp.append(jnp.tile(drive, periods), drive[:1])
+        memory = actuator.hysteresis.memory(actuator.hysteresis.table(), predictor.corners)
+        found = magnetize(actuator, actuator.coil.applied_field(whole), whole, dt, memory, actuator.coil.scheme, period=len(drive))
+        return found[3], found[1], whole
+
+    rows = [one(actuator, *row) for row in zip(predictor.drives[0], predictor.steps[0], strict=True)]
+    return [tuple(np.asarray(x) for x in row) for row in rows]

@@ -14,7 +14,7 @@ import pytest
 import magjax.programs as programs
 from magjax.bench import load_bench
 from magjax.chain import Timeline
-from magjax.programs import forget, kept
+from magjax.programs import forget, kept, often
 from magjax.simulate import Signals, run_chain
 
 pytest.importorskip("flatbuffers")
@@ -42,6 +42,11 @@ def scaled(line, values, factor, more=None):
     return [values * factor * line.dt, (line.time, None)], {"more": line.dt if more is None else more}
 
 
+@often
+def scaled_often(line, values):
+    return values * line.dt
+
+
 def test_a_program_is_read_and_not_traced_again(folder):
     line, values = Timeline(jnp.asarray(0.5), 6, True), jnp.arange(6.0)
     first = scaled(line, values, 2.0)
@@ -63,7 +68,7 @@ jax.config.update("jax_compilation_cache_dir", {folder!r})
 jax.config.update("jax_enable_x64", True)
 from fitting.model import on_device
 from magjax import linear, programs
-print(np.asarray(programs.kept(linear.inverse_of)(on_device(2.0 * np.eye(3))))[0, 0], len(programs.IN_MEMORY[-1]))
+print(np.asarray(programs.kept(linear.inverse_of)(on_device(2.0 * np.eye(3))))[0, 0], len(programs.IN_MEMORY[-1][0]))
 """
 
 
@@ -121,6 +126,14 @@ def test_what_is_spoken_for_stays_compiled_when_the_rest_is_dropped(folder):
     jax.clear_caches()
     scaled(line, values, 2.0)
     assert len(compiled) == 1 and TRACED == [2.0]
+    assert np.allclose(scaled_often(line, values), 0.5 * values)
+    compiled.clear()
+    forget(lambda kinds: False)  # but for what lasts
+    jax.clear_caches()
+    assert np.allclose(scaled_often(line, 2 * values), values) and not compiled
+    forget()
+    scaled_often(line, values)
+    assert len(compiled) == 1
 
 
 def test_files_that_changed_and_programs_that_were_spoiled_are_made_anew(folder, monkeypatch):

@@ -256,6 +256,37 @@ def jacobian():
     return found
 
 
+def grids():
+    """A fit of nine loops whose trial steps go by the Jacobian's grid, over the same all on the fine one; alone, and of many periods
+    beside a field that diffuses."""
+    import magjax.effects as effects
+    from fitting.joint import solve
+    from fitting.setup import Choices, build_problem, effect_parameters, free_parameters, spectra_of
+    from tests.studies.joint_fit import SINES, one_draw, settled
+
+    bench, found = load_bench("aa-050h"), {}
+    spectra = spectra_of(one_draw(settled("gauss"), 0)[0][: len(SINES)], bench)
+    for name, held, periods in (("alone", (), 3), ("14 periods, diffusion", (effects.FieldDiffusion(kappa=0.5),), 14)):
+        actuator = bench.actuator()
+        for effect in held:
+            actuator = actuator.with_effect(effect)
+        names = free_parameters(bench, actuator, effect_parameters(actuator))
+        problem, z = build_problem(spectra, actuator, bench, names, Choices(rest="negative", periods=periods))
+        own, both, seconds, weights = problem.passes.stride, {}, {}, np.asarray(problem.target.weights)
+
+        def run(problem=problem, z=z, weights=weights, both=both):
+            both[problem.passes.stride] = found = solve(problem, z, weights)
+            return found.z
+
+        for stride in (own, 1):
+            problem.passes.stride = stride
+            seconds[stride] = best(run, 3)
+        assert own > 1 and abs(both[own].chi2 / both[1].chi2 - 1) < 1e-2
+        found[f"{name}, over all on the fine grid (bar < 1)"] = seconds[own] / seconds[1]
+        found[f"{name}, s"] = seconds[own]
+    return found
+
+
 def compiler():
     """A residual and its Jacobian traced and compiled as `magjax.programs.COMPILER` asks, over the same as the compiler does by itself."""
     rows = {}
@@ -343,6 +374,7 @@ GROUPS = {
     "fit": joint_fit,
     "jacobian": jacobian,
     "compiler": compiler,
+    "grids": grids,
 }
 
 
