@@ -38,7 +38,7 @@ WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned fu
 MANY = 3  # effects in place of which a function that leaves no more is the better word: so many at once are seldom missing
 LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
 AS_MUCH, FORETOLD = 1.1, 0.5  # of the chi2 of effects on finer hats, and of what they miss check recordings by, that one may leave
-KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
+KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept; of check recordings, where those hardly tell
 HARDLY, ALIKE = 1e3, 3.0  # chi2/N of recordings left out, from which the linear model says no more than its size: as good to this factor
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 BASE_LOSSES = {  # of the base, that act as a constant times a rate
@@ -398,10 +398,11 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None, l
         )
     rows = tuple(check_errors(found.base.actuator, learned.result.actuator, check, bench)) if check else ()
     gained = [r["rms_after"] / max(r["rms_before"], 1e-300) for r in rows]
-    if gained and np.mean(np.square(gained)) > 1:
+    if gained and np.mean(np.square(gained)) > (KEPT if learned.left_out[1] > HARDLY else 1):
+        how = "worse" if np.mean(np.square(gained)) > 1 else "hardly better"
         return dataclasses.replace(
             found,
-            message=found.message + " A smooth function learned from them predicts the check recordings worse, so it is not kept.",
+            message=found.message + f" A smooth function learned from them predicts the check recordings {how}, so it is not kept.",
         )
     more = described(learned)
     start, end, part = region(learned)

@@ -11,6 +11,7 @@ import pytest
 
 import fitting.learned as learned_module
 from fitting.demo import concealed_actuator, record
+from fitting.diagnosis import Diagnosis
 from fitting.learned import Learned, _needless, band, chosen_places, described, left_out, prediction_interval, region
 from fitting.nonparametric import Place, evidence, prior_deviations
 from fitting.result import write_model
@@ -314,6 +315,27 @@ def test_where_recordings_left_out_are_hardly_foretold_what_leaves_least_is_lear
 
     monkeypatch.setattr(learned_module, "fit_term", fit_term)
     assert learned_module.learn(None, (), None).place.variables[0] == chosen
+
+
+@pytest.mark.parametrize(("missed", "after", "how"), [(50.0, 0.99, ""), (5e3, 0.99, "hardly better"), (5e3, 0.8, ""), (50.0, 1.1, "worse")])
+def test_where_they_are_hardly_foretold_check_recordings_decide_whether_it_is_kept(monkeypatch, missed, after, how):
+    class Described(Exception):
+        """It is kept."""
+
+    def kept(learned):
+        raise Described
+
+    learned = learned_of(placed("coil", ("flux_rate",), 300.0), missed, 6.0)
+    learned.result.actuator = None
+    monkeypatch.setattr(learned_module, "check_errors", lambda *a: [{"rms_before": 1.0, "rms_after": after}])
+    monkeypatch.setattr(learned_module, "described", kept)
+    found = Diagnosis("unknown_at", "said.", base=types.SimpleNamespace(actuator=None))
+    if how:
+        said = learned_module.with_learned_term(found, None, (), None, ("a check",), learned=learned)
+        assert said.message.endswith(f"{how}, so it is not kept.")
+    else:
+        with pytest.raises(Described):
+            learned_module.with_learned_term(found, None, (), None, ("a check",), learned=learned)
 
 
 @pytest.mark.parametrize("late", ["another place", "finer hats"])
