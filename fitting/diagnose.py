@@ -170,7 +170,9 @@ def _explained(begun: Beginning) -> Diagnosis:
         told = told_by_checks(task.sparing, reached.current, reached.foretell)
     if told is not None:
         if remembered := _remembered(begun, told) if reached.steps and zero is None else None:
-            return _with_memory(_examined(remembered), told)
+            found = _examined(remembered)
+            if not lost_there(found, told):
+                return _with_memory(found, told)
         plain, raw = (plain, raw) if reached.steps else (told, raw if begun.adopted else told)
         reached = dataclasses.replace(reached, current=told)
     evidence = Evidence(
@@ -196,6 +198,12 @@ def _remembered(begun, told) -> Beginning | None:
         if other := plain_there(task.sparing, begun.plain, told):
             return begun.on(task=task.on(choices=dataclasses.replace(task.choices, rest=told.choices.rest)), plain=other)
     return None
+
+
+def lost_there(found, told) -> bool:
+    """Whether a diagnosis from the start memory that was told has lost the effects that a fit from there still holds: it ends in
+    `unknown_at`, and leaves more than `told` does."""
+    return found.verdict == "unknown_at" and (found.repaired or found.base).chi2_per_sample > told.chi2_per_sample
 
 
 def _with_memory(found, told) -> Diagnosis:

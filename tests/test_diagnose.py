@@ -102,6 +102,18 @@ def test_effects_are_asked_for_again_where_the_plain_model_serves_better_from_th
     assert asked == [(True, (), "negative", (24, 18))] and (found is not None) is (fall > 25)
 
 
+@pytest.mark.parametrize(
+    ("verdict", "leaves", "repaired", "lost"),
+    [("unknown_at", 265.0, None, True), ("unknown_at", 308.0, 0.9, False), ("attributed", 308.0, 1.1, False), ("nothing_missing", 1.1, None, False)],
+)
+def test_effects_that_were_found_stay_where_nothing_is_found_from_the_memory_that_was_told(verdict, leaves, repaired, lost):
+    """A clipped source that was met to 0.96 was lost from a plain fit that left 308 for 342."""
+    found = module.Diagnosis(
+        verdict, "said.", base=SimpleNamespace(chi2_per_sample=leaves), repaired=repaired and SimpleNamespace(chi2_per_sample=repaired)
+    )
+    assert module.lost_there(found, SimpleNamespace(chi2_per_sample=0.96)) is lost
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("asked", "said"),
