@@ -10,6 +10,7 @@ from .verdict import HALF
 
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
+MADE_UP = 0.25  # of what effects take, that another start memory takes without them where they may have made up for that
 COARSE = 0.5  # of a misfit, that a finer density may leave where the first one was too coarse
 ALL_BUT = 0.05  # share of a misfit that the finest hats may leave to be gone on with up to FINEST_BELOW
 FINEST_LEAVE = 0.9  # the same of the finest hats, where those before have taken their share already
@@ -29,11 +30,12 @@ def better_valley(task, plain, candidates, current):
 
 
 def plain_there(task, plain, told):
-    """The plain fit from the start memory that check recordings told beside effects, where it leaves less than from its own: then these
+    """The plain fit from the start memory that check recordings told beside effects, where it takes a part of what these do: then they
     may have made up for that. None elsewhere."""
     task.say("the plain model from that start memory", told.chi2_per_sample)
     other = task.fit_on(plain, _without_found(told, plain), choices=dataclasses.replace(plain.choices, rest=told.choices.rest))
-    return other if chi2_of(other) < chi2_of(plain) - MIN_DROP else None
+    least = max(MIN_DROP, MADE_UP * (chi2_of(plain) - chi2_of(told)))
+    return other if chi2_of(other) < chi2_of(plain) - least else None
 
 
 def _without_found(found, plain):

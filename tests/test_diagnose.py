@@ -84,22 +84,24 @@ def test_the_model_offered_begins_where_the_check_recordings_say(bench, monkeypa
     assert "do not tell their start memory; the check recordings do: positive saturation" in str(found)
 
 
-@pytest.mark.parametrize("fall", [80.0, 20.0], ids=["better from there", "no better"])
-def test_effects_are_asked_for_again_where_the_plain_model_serves_better_from_the_start_memory_that_was_told(bench, monkeypatch, fall):
+@pytest.mark.parametrize(
+    ("fall", "leaves", "asks"), [(80.0, 1.2, True), (20.0, 1.2, False), (80.0, 2.2, False)], ids=["better from there", "no better", "a small part"]
+)
+def test_effects_are_asked_for_again_where_the_plain_model_serves_better_from_the_start_memory_that_was_told(bench, monkeypatch, fall, leaves, asks):
     """mean_field had made up for a wrong start memory on a bench without it."""
     def fitted(chi2, actuator, rest):
         return SimpleNamespace(chi2_per_sample=chi2, data_count=700, actuator=actuator, choices=Choices(knots=(24, 18), rest=rest))
 
     asked, actuator = [], bench.actuator()
-    plain, told = fitted(1.2, actuator, "demagnetized"), fitted(0.9, actuator.with_effect(SensorLag()), "negative")
+    plain, told = fitted(leaves, actuator, "demagnetized"), fitted(0.9, actuator.with_effect(SensorLag()), "negative")
 
     def fit_on(task, start, actuator, choices):
         asked.append((start is plain, actuator.effects, choices.rest, choices.knots))
-        return fitted(1.2 - fall / 700, actuator, choices.rest)
+        return fitted(leaves - fall / 700, actuator, choices.rest)
 
     monkeypatch.setattr(Task, "fit_on", fit_on)
     found = plain_module.plain_there(Task((), bench), plain, told)
-    assert asked == [(True, (), "negative", (24, 18))] and (found is not None) is (fall > 25)
+    assert asked == [(True, (), "negative", (24, 18))] and (found is not None) is asks
 
 
 @pytest.mark.parametrize(
