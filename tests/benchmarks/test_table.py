@@ -18,6 +18,7 @@ ROWS = {
     "exponent of the cost": ("batch", ["exponent of the cost"]),
     "jvp, Jacobian column": ("derivatives", ["jvp", "Jacobian column", "reverse"]),
     "Jacobian of a fit": ("jacobian", ["205 unknowns, over", "1089 unknowns, over"]),
+    "trial steps of a fit": ("grids", ["alone, over", "14 periods, diffusion, over"]),
     "static value and gradient": ("static", ["L = 25: value", "L = 200: value"]),
     "its peak memory at T = 1e6": ("memory", ["T = 1e6"]),
     "its memory at T = 10,000": ("memory", ["T = 10,000, L = 25", "T = 10,000, L = 200"]),
