@@ -853,6 +853,19 @@ def test_a_step_that_falls_on_the_coarse_grid_alone_is_taken_on_the_fine_one(mon
     assert both.converged and both.chi2 == pytest.approx(fine.chi2, rel=2e-3) and both.z == pytest.approx(fine.z, abs=2e-2)
 
 
+def test_no_step_is_kept_that_rises_on_the_fine_grid(monkeypatch):
+    """The coarse grid, and its Jacobian, have the whole slope the wrong way round."""
+    from fitting import joint
+
+    monkeypatch.setattr(joint, "data_residual", lambda problem, z, stride=1: (20.0 if stride == 1 else -10.0) * np.asarray(z))
+    monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: -10.0 * np.eye(1))
+    monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(1))
+    layout = SimpleNamespace(bounds=(np.full(1, -np.inf), np.full(1, np.inf)))
+    problem = SimpleNamespace(layout=layout, data_count=1, passes=SimpleNamespace(stride=4))
+    found = joint.solve(problem, np.ones(1), np.ones(0), evidence=False)
+    assert found.chi2 == 400.0 and found.z == [1.0] and not found.converged
+
+
 def test_an_iteration_that_is_too_slow_for_its_target_ends():
     from fitting.joint import _too_slow
 
