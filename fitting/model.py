@@ -243,6 +243,10 @@ class Predictor(eqx.Module):
                 yield part, members[at + first : at + min(first + rows, len(drives))]
             at += len(drives)
 
+    def filled(self, rows, axis: int = 0) -> np.ndarray:
+        """What belongs to the recordings of one of the `batches`, along an axis, with the last repeated as there."""
+        return np.take(rows, np.minimum(np.arange(len(self.index)), rows.shape[axis] - 1), axis)
+
     def for_any(self) -> "Predictor":
         """The same of one grid with `times` in place of many periods: marches of 8, 14 and 24 share their programs."""
         (periods,) = self.periods

@@ -146,11 +146,6 @@ def _moved(predictor, actuator, force):
     return jax.vmap(jax.vmap(one), (0, None))(force, predictor.steps[0])
 
 
-def _filled(waves, number):
-    """Waves of so many recordings, the last repeated, (columns, number, samples)."""
-    return waves[:, np.minimum(np.arange(number), waves.shape[1] - 1)]
-
-
 class Tangents:
     """Columns of learned terms about a fit, and what is left of them off its tangent space."""
 
@@ -193,7 +188,7 @@ class Tangents:
                 at = SIGNALS.index(ADDED_TO[term.place])
                 if term.place == "mechanics":
                     waves = [
-                        np.asarray(_moved(part, self.actuator, _filled(w, len(part.index))))[:, : w.shape[1]]
+                        np.asarray(_moved(part, self.actuator, part.filled(w, 1)))[:, : w.shape[1]]
                         for (part, _), w in zip(self.parts, waves, strict=True)
                     ]
                 lines = [np.einsum("rln,crn->crl", read[:, :, at], w, optimize=True) for read, w in zip(self.read, waves, strict=True)]

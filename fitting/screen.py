@@ -147,9 +147,9 @@ def _before(classes, trials, predictor, own, path, rows):
 def _changes(classes, trials, predictor, actuator, rows, readings, levels):
     """(class, shapes) of every effect, and the first-order change of the lines of the predictor's recordings, (columns, recordings,
     harmonics + 1)."""
-    own, number, every = marching(actuator), len(rows.mean), len(predictor.index)
-    fields = [[_filled(x, every) for x in (rows.marched.field, rows.marched.magnetization, rows.marched.spread)]]
-    path = (*(_filled(x, every) for x in rows.path()), predictor.steps[0])
+    own, number, filled = marching(actuator), len(rows.mean), predictor.filled
+    fields = [[filled(x) for x in (rows.marched.field, rows.marched.magnetization, rows.marched.spread)]]
+    path = (*(filled(x) for x in rows.path()), predictor.steps[0])
     times = np.asarray(predictor.periods[0])
     predictor = dataclasses.replace(predictor, periods=((path[0].shape[1] - 1) // rows.signals.shape[3],))  # those that the path has
     signals = signals_of(predictor.behind(), actuator, fields)
@@ -161,16 +161,11 @@ def _changes(classes, trials, predictor, actuator, rows, readings, levels):
     lines = [as_lines(x) for x in lines]
     for c in classes:
         for shapes in trials[c] if c.shells else ():
-            other = last_period(predictor.behind(predictor.corners), own.with_effect(c(**shapes)), _filled(levels, every), times)
+            other = last_period(predictor.behind(predictor.corners), own.with_effect(c(**shapes)), filled(levels), times)
             change = lines_of(predictor, signals_of(predictor.behind(), actuator, [other])) - lines_of(predictor, signals)
             lines.append(change[None, :number])
             asked.append((c, shapes))
     return asked, np.concatenate(lines)
-
-
-def _filled(rows, every: int) -> np.ndarray:
-    """The last row repeated, as in `Predictor.batches`."""
-    return np.asarray(rows)[np.minimum(np.arange(every), len(rows) - 1)]
 
 
 def columns(problem, z):

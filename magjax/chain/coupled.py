@@ -213,7 +213,7 @@ def run_until_steady(march: March, applied, current, tolerance, most):
 
     `applied`, `current`: one period and its first sample again, (period + 1,); `march`: of that `period`. It goes on until
     H + M in the second half of a period, behind its extrema, differs from the period before by less than `tolerance` of its
-    peak to peak (None: however much that is), or `most` periods are through. Returns field H, magnetization M, its spread, relay field, residual,
+    peak to peak, or `most` periods are through. Returns field H, magnetization M, its spread, relay field, residual,
     (period,) each, overflow, and the last such difference. Not for reverse-mode derivatives.
     """
     count = len(applied) - 1
@@ -221,7 +221,7 @@ def run_until_steady(march: March, applied, current, tolerance, most):
 
     def going(state):
         _, _, change, number = state
-        return (number < most) if tolerance is None else (change > tolerance) & (number < most)
+        return (change > tolerance) & (number < most)
 
     def again(state):
         carry, (H0, M0, *_), _, number = state
