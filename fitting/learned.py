@@ -402,7 +402,7 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None, l
         how = "worse" if np.mean(np.square(gained)) > 1 else "hardly better"
         return dataclasses.replace(
             found,
-            message=found.message + f" A smooth function learned from them predicts the check recordings {how}, so it is not kept.",
+            message=found.message + f" A smooth function learned from the recordings of the fit predicts the check recordings {how}, so it is not kept.",
         )
     more = described(learned)
     start, end, part = region(learned)
