@@ -15,7 +15,7 @@ from magjax.effects.learned_term import OUTPUTS, UNITS, LearnedTerm
 from magjax.programs import kept
 from magjax.simulate import run_chain
 
-from .attribute import AT_NOISE, excess_of
+from .attribute import AT_NOISE, MISFIT, excess_of
 from .check import check_errors, foretold_text
 from .diagnosis import misfit
 from .finer import FINER_FROM, REFINE_BESIDE, finer_hats
@@ -30,16 +30,17 @@ from .uncertainty import WIDEN, covariance
 from .verdict import WORSE, asked_for
 
 TRIED = 4  # leaders that are fitted jointly
-NEAR = 0.9  # share of the best evidence that makes another boundary worth a fit
+NEAR, NEAR_IF_SIMPLE = 0.9, 0.7  # share of the best evidence that makes another boundary worth a fit; a function of one variable there beside one of two
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
 CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned function leaves where the effect is the wrong name
 MANY = 3  # effects in place of which a function that leaves no more is the better word: so many at once are seldom missing
-LEAVES_MISFIT = 1.5  # chi2/N beside an effect that was named, from which a learned function is tried in its place
+LEAVES_MISFIT = MISFIT  # chi2/N beside an effect that was named, from which a learned function is tried in its place;
+NARROW = 0.35  # of the range, within which one at its own block bends where no form of its law does: a stop, a kink
 AS_MUCH, FORETOLD = 1.1, 0.5  # of the chi2 of effects on finer hats, and of what they miss check recordings by, that one may leave
-KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept; of check recordings, where those hardly tell
-HARDLY, ALIKE = 1e3, 3.0  # chi2/N of recordings left out, from which the linear model says no more than its size: as good to this factor
+KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept; of that of check recordings, in place of a name at its own block
+UNSEEN = 0.1  # of what a recording alone shows: left out, it is taken to miss no more than what is left of it by this
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 BASE_LOSSES = {  # of the base, that act as a constant times a rate
     ("coil", "flux_rate"): ("coil.R_eddy", "coil.k_eddy", "effects.eddy_currents.k"),
@@ -91,8 +92,9 @@ def left_out(problem, solution) -> np.ndarray:
     for k in range(R):
         mine = owner == k
         hat = J[mine] @ inverse @ J[mine].T
-        # a direction that only this recording shows is not foretold at all: it counts with what its prior leaves
-        alone = np.linalg.solve((1 + 1e-9) * np.eye(len(hat)) - hat, r[mine])
+        # a direction that only this recording shows is not foretold at all: what is left of it is next to nothing, and says no more
+        shown, directions = np.linalg.eigh(hat)
+        alone = directions.T @ r[mine] / (1 - np.minimum(shown, 1 - UNSEEN))
         rows.append(float(alone @ alone) / (2 * finite[k].sum() - finite[k, 0]))
     return np.asarray(rows)
 
@@ -153,17 +155,20 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
 def chosen_places(places) -> list[Place]:
     """Places worth a joint fit: of each block whose evidence comes near the first, a function of one variable where it
     serves nearly as well, else the best; in the first block two simple ones beside it where they come some way: one that is right
-    foretells more, and its evidence is low where the rest of the model has bent to what is missing."""
+    foretells more, and its evidence is low where the rest of the model has bent to what is missing. Beside one of two variables those
+    of one are worth it from farther off.
+    """
     best = places[0].evidence
+    farther = np.inf if any(p.simple and p.evidence > SIMPLER * best for p in places) else NEAR_IF_SIMPLE * best
     chosen = []
     for block in dict.fromkeys(p.block for p in places):
         mine = [p for p in places if p.block == block]
-        if mine[0].evidence <= NEAR * best:
-            continue
         serves = any(p.simple and p.evidence > SIMPLER * mine[0].evidence for p in mine)
-        least, most = (SIMPLER, 1) if chosen or serves else (SOME_WAY, 2)
-        chosen += [p for p in mine if p.simple and p.evidence > least * mine[0].evidence][:most]
-        chosen += [] if serves else [mine[0]]
+        near = mine[0].evidence > NEAR * best
+        first, nearly = mine[0] is places[0], SIMPLER * mine[0].evidence if near else np.inf
+        least, most = (SOME_WAY * best, 2) if first and not serves else (min(nearly, farther), 1)
+        chosen += [p for p in mine if p.simple and p.evidence > least][:most]
+        chosen += [mine[0]] if near and not serves else []
     return chosen[:TRIED]
 
 
@@ -177,7 +182,7 @@ def other_places(places, tried) -> list[Place]:
 
 def _needless(place, tried) -> bool:
     """Whether one of those tried meets the noise and is as simple and far ahead to first order, or is simple in the same block."""
-    met = [t for t in tried if t.result.chi2_per_sample < MET]
+    met = [t for t in tried if t.result.chi2_per_sample < MET and t.place.simple >= place.simple]
     same = any(t.place.simple and t.place.block == place.block for t in met) and not place.simple
     return same or any(place.evidence < CLOSE * t.place.evidence for t in met)
 
@@ -217,15 +222,11 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
 
 
 def _as_good(tried) -> list[Learned]:
-    """Of terms fitted, those that foretell recordings left out about as well as the first of them, the best one first: the one that the
-    rest of the model hides least, for another must be larger to be seen as much. Where that is hardly foretold at all, the one that
-    leaves least.
+    """Of terms fitted, those that foretell recordings left out about as well as the first of them, the best one first: the simplest, and
+    of these the one that the rest of the model hides least, for another must be larger to be seen as much.
     """
-    best = tried[0].left_out[1]
-    if best > HARDLY:
-        return sorted((t for t in tried if t.worth and t.left_out[1] < ALIKE * best), key=lambda t: t.result.chi2_per_sample)
-    near = 1 + 1.3 * (best - 1) + 0.1
-    return sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: -t.place.visibility)
+    near = 1 + 1.3 * (tried[0].left_out[1] - 1) + 0.1
+    return sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: (not t.place.simple, -t.place.visibility))
 
 
 def _on_finer_hats(learned, base, recordings, bench, progress) -> Learned:
@@ -366,8 +367,9 @@ def described(learned: Learned) -> dict:
 def better_learned(base, named, blocks, recordings, bench, number: int = 1, check=(), progress=None) -> Learned | None:
     """A term that shows effects to be the wrong names: in another block than `blocks`, it leaves next to nothing of what they
     leave, or no more than `MANY` do, and foretells recordings left out better, and check recordings no worse; in place of one effect it
-    must be as simple. Of effects that leave a misfit on a density finer than the base's, it may leave as much, where it takes most of what
-    they miss check recordings by. None elsewhere.
+    must be as simple, and may be at its block where it bends in one `NARROW` place and check recordings say so. Of effects that leave a
+    misfit on a density finer than the base's, it may leave as much, simple or not, where it takes most of what they miss check recordings by.
+    None elsewhere.
 
     `base`: the plain fit; `named`: that with the effects, their `number`.
     """
@@ -375,16 +377,21 @@ def better_learned(base, named, blocks, recordings, bench, number: int = 1, chec
     hats, chosen = base.choices.knots, named.choices.knots
     finer = named.chi2_per_sample > LEAVES_MISFIT and None not in (hats, chosen) and chosen > hats
     learned = learn(base, recordings, bench, progress, np.inf if finer else most * named.data_count)
-    if learned is None or learned.place.block in blocks or not (number > 1 or learned.place.simple):
+    if learned is None:
+        return None
+    same, simple = learned.place.block in blocks, number > 1 or learned.place.simple
+    if not (simple or finer) or (same and (number > 1 or not region(learned)[2] < NARROW)):
         return None
     rows = check_errors(named.actuator, learned.result.actuator, check, bench)
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
     if after > WORSE[0] * before + WORSE[1] * len(rows):
         return None
+    if same and not after < KEPT * before:
+        return None
     left = learned.result.chi2_per_sample
-    if left <= most and not learned.left_out[1] > left_out(named.problem, named.solution).mean():
+    if simple and left <= most and not learned.left_out[1] > left_out(named.problem, named.solution).mean():
         return learned
-    return learned if finer and left < AS_MUCH * named.chi2_per_sample and after < FORETOLD * before else None
+    return learned if finer and not same and left < AS_MUCH * named.chi2_per_sample and after < FORETOLD * before else None
 
 
 def with_learned_term(found, base, recordings, bench, check=(), progress=None, learned=None):
@@ -398,11 +405,10 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None, l
         )
     rows = tuple(check_errors(found.base.actuator, learned.result.actuator, check, bench)) if check else ()
     gained = [r["rms_after"] / max(r["rms_before"], 1e-300) for r in rows]
-    if gained and np.mean(np.square(gained)) > (KEPT if learned.left_out[1] > HARDLY else 1):
-        how = "worse" if np.mean(np.square(gained)) > 1 else "hardly better"
+    if gained and np.mean(np.square(gained)) > 1:
         return dataclasses.replace(
             found,
-            message=found.message + f" A smooth function learned from the recordings of the fit predicts the check recordings {how}, so it is not kept.",
+            message=found.message + " A smooth function learned from the recordings of the fit predicts the check recordings worse, so it is not kept.",
         )
     more = described(learned)
     start, end, part = region(learned)

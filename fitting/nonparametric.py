@@ -42,7 +42,7 @@ SETS = (
     ("mechanics", ("displacement",)), ("mechanics", ("displacement_rate",)), ("mechanics", ("displacement", "displacement_rate")),
     ("mechanics", ("stretch", "magnetization")),
     ("sensor", ("reading",)), ("sensor", ("reading_rate",)), ("sensor", ("reading", "reading_rate")), ("sensor", ("current_rate",)),
-    ("sensor", ("current", "current_rate")),
+    ("sensor", ("current", "current_rate")), ("sensor", ("magnetization",)), ("sensor", ("flux_rate",)),
 )  # fmt: skip
 FACTORS = (  # a function of the first, times the second: a loss, an inductance, a damping that varies
     ("source", ("current", "current_rate")), ("coil", ("magnetization", "flux_rate")), ("coil", ("field", "flux_rate")),

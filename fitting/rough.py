@@ -12,7 +12,7 @@ from .search import SECOND_Z, search
 from .setup import Choices
 from .task import freed_beyond
 from .together import together
-from .verdict import FULL_SHARE, HALF, NULL_CHI2, Z_THRESHOLD, as_expected, too_little
+from .verdict import FULL_SHARE, HALF, NULL_CHI2, Z_THRESHOLD, as_expected, like_density, too_little
 
 FORETOLD = 0.3  # of the check recordings' misfit that a repair may leave: of their sum, and of the middle one
 CLEAR_Z = 20.0  # the score of an effect that no density imitates: on nulls at chi2/N of 3 the highest are 6 to 7
@@ -27,8 +27,8 @@ def without_chance(evidence) -> Evidence:
     """The evidence without effects that take less than half of a misfit of which the scores tell nothing, or leave one though
     the density bends to them: they move its steps about by chance."""
     steps = evidence.reached.steps
-    like_density = evidence.missing and all(best.name in LIKE_DENSITY for best, *_ in steps)
-    if not steps or not _tells_nothing(evidence) or (evidence.share > HALF and not like_density):
+    by_chance = evidence.missing and like_density(evidence)
+    if not steps or not _tells_nothing(evidence) or (evidence.share > HALF and not by_chance):
         return evidence
     reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
     return dataclasses.replace(evidence, reached=reached)

@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.words import sized
 
-from .attribute import MISFIT, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
+from .attribute import LIKE_DENSITY, MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
 from .check import check_errors, foretold_text
 from .diagnosis import Diagnosis, Evidence, least_excess, misfit
 from .experiments import INSTRUMENTS, instrument_request
@@ -48,6 +48,7 @@ FREE_TEXT = (
     " The recordings' mean levels take no part in the fit, for they differ from the model's by {} (rms): a zero that moves, or more of what is missing."
 )
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
+DENSITY_TEXT = "{} takes some of it, as a density does, and predicts the check recordings no better, so it is not named."
 PLAIN_TEXT = "The model offered is the plain one, which predicts the check recordings better than any repair."
 HIDDEN_TEXT = (
     " The fitted recordings alone do not show {}, for a density does nearly the same (chi2 falls by {:.0f}); it is named for the check recordings, "
@@ -103,6 +104,10 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     far_off = evidence.plain.chi2_per_sample > NO_BETTER[0] and before > NO_BETTER[1] * len(rows)
     hardly = far_off and after > NO_BETTER[2] * before
     if steps and (worse or hardly) and not foretold_all_the_same(evidence, rough, hardly):  # a repair that foretells no better is not physics
+        if density_alone(evidence):
+            reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
+            names = " and ".join(best.name for best, *_ in steps)
+            return verdict(dataclasses.replace(evidence, reached=reached), rough=True).noted(DENSITY_TEXT.format(names))
         how = "worse" if worse else "hardly better"
         return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
@@ -135,10 +140,24 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
 
 def foretold_all_the_same(evidence, rough, hardly) -> bool:
     """Whether check recordings that a repair misses as far as before, or farther, do not refuse it; asked where they would alone,
-    for it takes Jacobians of theirs."""
-    if evidence.missing and not rough:
+    for it takes Jacobians of theirs. They do refuse what a density does as well, alone: nothing else speaks for it."""
+    if (evidence.missing and not rough) or like_density(evidence):
         return False
     return as_expected(evidence) or (not hardly and not evidence.missing and hardly_against(evidence))
+
+
+def like_density(evidence) -> bool:
+    """Whether a density does as well what all effects that were found do."""
+    return all(best.name in LIKE_DENSITY for best, *_ in evidence.reached.steps)
+
+
+def density_alone(evidence) -> bool:
+    """Whether what was found is what a density does as well, of a misfit that a rough one leaves, and nothing else that was fitted takes
+    half of that: then it stands for the hats that do not follow it."""
+    plain = evidence.plain
+    others = [c.achieved_chi2_drop or 0.0 for c in evidence.reached.tried.values() if c.name not in LIKE_DENSITY]
+    half = HALF * (chi2_of(plain) - NULL_CHI2 * plain.data_count)
+    return like_density(evidence) and plain.chi2_per_sample < ROUGH_CHI2 and max(others, default=0.0) < half
 
 
 def as_expected(evidence) -> bool:

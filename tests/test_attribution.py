@@ -743,6 +743,37 @@ def test_what_errs_as_it_expects_is_named_all_the_same(monkeypatch, expected, wo
 
 
 @pytest.mark.parametrize(
+    ("name", "begun", "others", "after", "word"),
+    [
+        ("mean_field", 1.39, 0.3, 8.0, "nothing_missing"),
+        ("mean_field", 1.39, 0.6, 8.0, "unknown_at"),
+        ("mean_field", 3.4, 0.3, 8.0, "unknown_at"),
+        ("creep", 1.39, 0.3, 8.0, "attributed"),
+        ("mean_field", 1.39, 0.3, 1.2, "attributed"),
+    ],
+    ids=["a rough density", "another takes half", "more than that leaves", "no density does it", "foretold"],
+)
+def test_what_a_density_does_as_well_must_foretell_the_checks(monkeypatch, name, begun, others, after, word):
+    """Nothing was missing from a density of ridges: a mean_field turned them towards the hats, 1.39 to 1.04, and missed the check
+    recordings by 4 and 8 times their noise for 2 and 4, as it expected."""
+    evidence = evidence_of(monkeypatch, 1.0, (1.4, 4.0), (1.3, after))
+    plain = SimpleNamespace(chi2_per_sample=begun, data_count=COUNT, actuator=None)
+    best = trial(name, 1.0, base=begun)
+    drop = others * (begun - 0.95) * COUNT
+    second = dataclasses.replace(candidate("second_mode", -8.3), achieved_chi2_drop=drop)
+    reached = dataclasses.replace(
+        evidence.reached, current=best.result, steps=[(best, [], [], plain)], tried={"second_mode": second, name: best.candidate}
+    )
+    evidence = dataclasses.replace(
+        evidence, reached=reached, plain=plain, raw=plain, bench=SimpleNamespace(drive="current", constants={}, free=(), output="displacement")
+    )
+    monkeypatch.setattr(fitting.verdict, "as_expected", lambda e: True)
+    monkeypatch.setattr(fitting.verdict, "found_rows", lambda e: ([{"name": name, "block": "?"}] if e.reached.steps else [], [], {}, []))
+    found = fitting.verdict.verdict(evidence)
+    assert found.verdict == word and ("mean_field takes some of it" in found.message) == (word == "nothing_missing")
+
+
+@pytest.mark.parametrize(
     ("chi2n", "before", "after", "word"),
     [
         (1.0, (1.4, 2.0), (1.3, 4.0), "attributed"),

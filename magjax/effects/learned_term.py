@@ -28,7 +28,7 @@ PLACES = {
     "hysteresis": ("field", "magnetization", "field_rate"),
     "magnetostriction": ("magnetization", "field", "magnetization_rate", "field_rate"),
     "mechanics": ("displacement", "displacement_rate", "magnetization", "stretch"),
-    "sensor": ("reading", "reading_rate", "current", "current_rate"),
+    "sensor": ("reading", "reading_rate", "current", "current_rate", "magnetization", "flux_rate"),
 }
 OUTPUTS = {"source": "A", "coil": "A/m", "hysteresis": "A/m", "magnetostriction": "m", "mechanics": "m", "sensor": "reading"}
 
@@ -229,6 +229,7 @@ class LearnedTerm(AbstractEffect):
         return reading + self._of(
             {
                 "reading": lambda: reading, "reading_rate": lambda: line.derivative(reading), "current": lambda: current,
-                "current_rate": lambda: line.derivative(current),
+                "current_rate": lambda: line.derivative(current), "magnetization": lambda: signals["magnetization"],
+                "flux_rate": lambda: line.derivative(signals["flux_density"]),
             }
         )  # fmt: skip
