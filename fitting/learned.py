@@ -368,8 +368,7 @@ def better_learned(base, named, blocks, recordings, bench, number: int = 1, chec
     """A term that shows effects to be the wrong names: in another block than `blocks`, it leaves next to nothing of what they
     leave, or no more than `MANY` do, and foretells recordings left out better, and check recordings no worse; in place of one effect it
     must be as simple, and may be at its block where it bends in one `NARROW` place and check recordings say so. Of effects that leave a
-    misfit on a density finer than the base's, it may leave as much, simple or not, where it takes most of what they miss check recordings by.
-    None elsewhere.
+    misfit on a density finer than the base's, it may leave as much, where it takes most of what they miss check recordings by. None elsewhere.
 
     `base`: the plain fit; `named`: that with the effects, their `number`.
     """
@@ -377,10 +376,10 @@ def better_learned(base, named, blocks, recordings, bench, number: int = 1, chec
     hats, chosen = base.choices.knots, named.choices.knots
     finer = named.chi2_per_sample > LEAVES_MISFIT and None not in (hats, chosen) and chosen > hats
     learned = learn(base, recordings, bench, progress, np.inf if finer else most * named.data_count)
-    if learned is None:
+    if learned is None or not (number > 1 or learned.place.simple):
         return None
-    same, simple = learned.place.block in blocks, number > 1 or learned.place.simple
-    if not (simple or finer) or (same and (number > 1 or not region(learned)[2] < NARROW)):
+    same = learned.place.block in blocks
+    if same and (number > 1 or not region(learned)[2] < NARROW):
         return None
     rows = check_errors(named.actuator, learned.result.actuator, check, bench)
     before, after = misfit(rows, "rms_before"), misfit(rows, "rms_after")
@@ -389,7 +388,7 @@ def better_learned(base, named, blocks, recordings, bench, number: int = 1, chec
     if same and not after < KEPT * before:
         return None
     left = learned.result.chi2_per_sample
-    if simple and left <= most and not learned.left_out[1] > left_out(named.problem, named.solution).mean():
+    if left <= most and not learned.left_out[1] > left_out(named.problem, named.solution).mean():
         return learned
     return learned if finer and not same and left < AS_MUCH * named.chi2_per_sample and after < FORETOLD * before else None
 

@@ -868,6 +868,7 @@ def test_a_learned_function_shows_an_effect_to_be_the_wrong_name(monkeypatch, le
 
     assert (asked("attributed", named) is learned) == wrong
     assert asked("nothing_missing", None) is None and asked("attributed", result(1.25)) is None
+    assert (asked("attributed", result(1.4)) is learned) == wrong
     # also where the first of several was named alone, and in place of several, for which it need not be simple
     single, several = evidence, dataclasses.replace(reached, current=result(2.4), steps=[*reached.steps, *reached.steps])
     evidence = dataclasses.replace(evidence, reached=several)

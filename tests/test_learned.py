@@ -18,6 +18,7 @@ from fitting.result import write_model
 from fitting.setup import Choices
 from fitting.task import Late
 from magjax.bench import load_bench
+from magjax.constants import MU0
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.effects.learned_term import OUTPUTS, PLACES, LearnedTerm
 from magjax.model_file import load_model
@@ -85,6 +86,20 @@ def test_its_model_is_read_again_bit_for_bit(tmp_path):
         np.asarray(simulate(act, CURRENT, DT, periodic=True).reading),
         np.asarray(simulate(again, CURRENT, DT, periodic=True).reading),
     )
+
+
+def test_a_sensor_reads_along_with_a_stray_field():
+    """Magnetization and the rate of the flux, the relays' field not among it."""
+    act = actuator(20)
+    base = simulate(act, CURRENT, DT, periodic=True)
+    flux = MU0 * (np.asarray(base.field) + np.asarray(base.magnetization))
+    rate = np.fft.irfft(2j * np.pi * np.fft.rfftfreq(len(flux), DT) * np.fft.rfft(flux), len(flux))
+    for name, stray in (("magnetization", np.asarray(base.magnetization)), ("flux_rate", rate)):
+        top = RANGES[name][1]
+        term = LearnedTerm.null("sensor", (name,), [-top], [top], (1,), np.ones(1), 1e-8, coefficients=[2.0])
+        found = simulate(act.with_effect(term), CURRENT, DT, periodic=True)
+        added = np.asarray(found.reading) - np.asarray(base.reading)
+        assert np.abs(added - 2e-8 * stray / top).max() < 1e-2 * np.abs(added).max() and np.ptp(added) > 0
 
 
 def test_the_function_stays_as_at_its_edge_beyond_the_range():
