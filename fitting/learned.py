@@ -30,7 +30,7 @@ from .uncertainty import WIDEN, covariance
 from .verdict import WORSE, asked_for
 
 TRIED = 4  # leaders that are fitted jointly
-NEAR, NEAR_IF_SIMPLE = 0.9, 0.7  # share of the best evidence that makes another boundary worth a fit; a function of one variable there beside one of two
+NEAR, NEAR_IF_SIMPLE = 0.9, 0.6  # share of the best evidence that makes another boundary worth a fit; a function of one variable there beside one of two
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
 CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
@@ -40,7 +40,7 @@ LEAVES_MISFIT = MISFIT  # chi2/N beside an effect that was named, from which a l
 NARROW = 0.35  # of the range, within which one at its own block bends where no form of its law does: a stop, a kink
 AS_MUCH, FORETOLD = 1.1, 0.5  # of the chi2 of effects on finer hats, and of what they miss check recordings by, that one may leave
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept; of that of check recordings, in place of a name at its own block
-UNSEEN = 0.1  # of what a recording alone shows: left out, it is taken to miss no more than what is left of it by this
+UNSEEN = 0.03  # of what a recording alone shows: left out, it is taken to miss no more than what is left of it by this
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 BASE_LOSSES = {  # of the base, that act as a constant times a rate
     ("coil", "flux_rate"): ("coil.R_eddy", "coil.k_eddy", "effects.eddy_currents.k"),
