@@ -82,7 +82,7 @@ def _boundaries(unknown):
         "Evidence, share and visibility are to first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit "
         "is with a smooth function there than without. Visible: the part of it that density and constants cannot make. The best by evidence "
         "(where none of them serves, the simple ones of the other blocks, too) were fitted jointly with all else on the plain model's density; what "
-        "decides among these is the χ²/N of recordings left out one at a time, and of those that come near each other there, which is more visible. "
+        "decides among these is the χ²/N of recordings left out one at a time, and of those that come near each other there, the simpler, then the more visible one. "
         "The one that was kept may then have been given a finer density."
     )
     head = ["block", "function of", "evidence", "share explained", "visible", *(FITTED if told else ()), "choice"]
