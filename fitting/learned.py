@@ -76,7 +76,7 @@ class Learned:
 def left_out(problem, solution) -> np.ndarray:
     """chi2 per datum of each recording foretold from the others, by the linear model about the optimum.
 
-    With H = J (J'J + P)^-1 J' the residual of the rows of a recording fitted without them is (I - H_kk)^-1 r_k.
+    With H = J (J'J + P)^-1 J' the residual of the rows of a recording fitted without them is (I - H_kk)^-1 r_k; I - H_kk at least `UNSEEN`.
     """
     n = problem.layout.density_unknowns
     J, r = data_jacobian(problem, solution.z), data_residual(problem, solution.z)

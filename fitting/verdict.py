@@ -48,7 +48,7 @@ FREE_TEXT = (
     " The recordings' mean levels take no part in the fit, for they differ from the model's by {} (rms): a zero that moves, or more of what is missing."
 )
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
-DENSITY_TEXT = "{} takes some of it, as a density does, and predicts the check recordings no better, so it is not named."
+DENSITY_TEXT = "As a density does, {} takes some of it; it predicts the check recordings no better, so it is not named."
 PLAIN_TEXT = "The model offered is the plain one, which predicts the check recordings better than any repair."
 HIDDEN_TEXT = (
     " The fitted recordings alone do not show {}, for a density does nearly the same (chi2 falls by {:.0f}); it is named for the check recordings, "
@@ -106,7 +106,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     if steps and (worse or hardly) and not foretold_all_the_same(evidence, rough, hardly):  # a repair that foretells no better is not physics
         if density_alone(evidence):
             reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
-            names = " and ".join(best.name for best, *_ in steps)
+            names = " with ".join(best.name for best, *_ in steps)
             return verdict(dataclasses.replace(evidence, reached=reached), rough=True).noted(DENSITY_TEXT.format(names))
         how = "worse" if worse else "hardly better"
         return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
