@@ -163,7 +163,7 @@ def sizes_of(name, result) -> dict:
     """The parameters of an effect as a fit has them, and what was given it, without error; not the details of its law that were held."""
     prefix = f"effects.{name}."
     fitted = {
-        e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit}
+        e.name[len(prefix) :]: {"value": e.value, "stderr": e.stderr, "unit": e.unit} | ({"at_bound": True} if e.at_bound else {})
         for e in result.estimates
         if e.name.startswith(prefix) and e.free
     }

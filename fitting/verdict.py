@@ -49,6 +49,7 @@ FREE_TEXT = (
 )
 ROUGH_TEXT = " What is left above the noise is a density rougher than the fit's, most likely."
 DENSITY_TEXT = "As a density does, {} takes some of it; it predicts the check recordings no better, so it is not named."
+UNCHECKED_TEXT = "As a density does, {} takes some of it; only check recordings, at other amplitudes and offsets, could tell the two apart, so it is not named."
 PLAIN_TEXT = "The model offered is the plain one, which predicts the check recordings better than any repair."
 HIDDEN_TEXT = (
     " The fitted recordings alone do not show {}, for a density does nearly the same (chi2 falls by {:.0f}); it is named for the check recordings, "
@@ -105,11 +106,11 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
     hardly = far_off and after > NO_BETTER[2] * before
     if steps and (worse or hardly) and not foretold_all_the_same(evidence, rough, hardly):  # a repair that foretells no better is not physics
         if density_alone(evidence):
-            reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
-            names = " with ".join(best.name for best, *_ in steps)
-            return verdict(dataclasses.replace(evidence, reached=reached), rough=True).noted(DENSITY_TEXT.format(names))
+            return _by_density(evidence, DENSITY_TEXT)
         how = "worse" if worse else "hardly better"
         return _unknown(evidence, common, f" The repair that fits best predicts the check recordings {how}, so it is not named.")
+    if steps and not raw and density_alone(evidence):
+        return _by_density(evidence, UNCHECKED_TEXT)
     if after > max(CONFIRMED[0] * before, CONFIRMED[1] * len(rows)):
         evidence = dataclasses.replace(evidence, reached=unconfirmed(evidence.reached))
     effects, groups, sizes, rivals = found_rows(evidence)
@@ -136,6 +137,13 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         if best.name in evidence.reached.hidden:
             form += HIDDEN_TEXT.format(best.name, best.drop, evidence.reached.foretell.says_for(best.result, previous))
     return dataclasses.replace(found, message=found.message + form + (ROUGH_TEXT if rough else ""))
+
+
+def _by_density(evidence, note) -> Diagnosis:
+    """The verdict of a misfit that is put down to the density, with a `note` on the effects that took some of it."""
+    reached = dataclasses.replace(evidence.reached, current=evidence.plain, steps=[], form=None)
+    names = " with ".join(best.name for best, *_ in evidence.reached.steps)
+    return verdict(dataclasses.replace(evidence, reached=reached), rough=True).noted(note.format(names))
 
 
 def foretold_all_the_same(evidence, rough, hardly) -> bool:

@@ -750,13 +750,19 @@ def test_what_errs_as_it_expects_is_named_all_the_same(monkeypatch, expected, wo
         ("mean_field", 3.4, 0.3, 8.0, "unknown_at"),
         ("creep", 1.39, 0.3, 8.0, "attributed"),
         ("mean_field", 1.39, 0.3, 1.2, "attributed"),
+        ("mean_field", 1.39, 0.3, None, "nothing_missing"),
+        ("mean_field", 1.39, 0.6, None, "attributed"),
+        ("mean_field", 3.4, 0.3, None, "attributed"),
+        ("creep", 1.39, 0.3, None, "attributed"),
     ],
-    ids=["a rough density", "another takes half", "more than that leaves", "no density does it", "foretold"],
+    ids=["a rough density", "another takes half", "more than that leaves", "no density does it", "foretold"]
+    + ["no checks", "no checks, another takes half", "no checks, more than that leaves", "no checks, no density does it"],
 )
 def test_what_a_density_does_as_well_must_foretell_the_checks(monkeypatch, name, begun, others, after, word):
     """Nothing was missing from a density of ridges: a mean_field turned them towards the hats, 1.39 to 1.04, and missed the check
-    recordings by 4 and 8 times their noise for 2 and 4, as it expected."""
-    evidence = evidence_of(monkeypatch, 1.0, (1.4, 4.0), (1.3, after))
+    recordings by 4 and 8 times their noise for 2 and 4, as it expected. Without check recordings it was named all the same."""
+    evidence = evidence_of(monkeypatch, 1.0, (1.4, 4.0), (1.3, after or 1.0))
+    evidence = evidence if after else dataclasses.replace(evidence, checks=((), ()))
     plain = SimpleNamespace(chi2_per_sample=begun, data_count=COUNT, actuator=None)
     best = trial(name, 1.0, base=begun)
     drop = others * (begun - 0.95) * COUNT
@@ -771,6 +777,7 @@ def test_what_a_density_does_as_well_must_foretell_the_checks(monkeypatch, name,
     monkeypatch.setattr(fitting.verdict, "found_rows", lambda e: ([{"name": name, "block": "?"}] if e.reached.steps else [], [], {}, []))
     found = fitting.verdict.verdict(evidence)
     assert found.verdict == word and ("mean_field takes some of it" in found.message) == (word == "nothing_missing")
+    assert ("only check recordings" in found.message) == (word == "nothing_missing" and after is None)
 
 
 @pytest.mark.parametrize(
@@ -1224,9 +1231,16 @@ def test_the_range_of_a_sensors_curve_stands_beside_its_size():
     assert {n: (p["value"], p["stderr"], p["unit"]) for n, p in sizes.items()} == {
         "q": (0.02, 0.001, "1"), "centre": (3e-6, 0.0, "m"), "half": (2e-5, 0.0, "m")
     }  # fmt: skip
-    at_bound = {"of_field": {"value": 1.0, "stderr": 0.0, "unit": "1"}}  # fitted
-    assert size_of(at_bound) == "of_field = 1 ± 0"
     assert size_of(sizes) == "q = 0.02 ± 0.001; centre = 3e−6 m (given); half = 2e−5 m (given)"
+
+
+def test_a_size_at_its_bound_is_shown_as_such():
+    """The spread of a path's lags ended at 1, and was shown as "1 ± 0"."""
+    rows = [("gain", 0.1, 0.01, False), ("tilt", 1.0, 0.0, True)]
+    estimates = [Estimate(f"effects.creep.{n}", value, error, "1", "", True, 0.0, at_bound=at) for n, value, error, at in rows]
+    sizes = sizes_of("creep", SimpleNamespace(estimates=estimates))
+    assert [p.get("at_bound") for p in sizes.values()] == [None, True]
+    assert size_of(sizes) == "gain = 0.1 ± 0.01; tilt = 1 (at its bound)"
 
 
 def test_rivals_that_meet_the_noise_are_compared_with_the_details_of_their_laws(monkeypatch):

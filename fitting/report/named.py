@@ -31,11 +31,12 @@ def named(found, facts):
 
 
 def size_of(parameters) -> str:
-    """Parameters with their errors; what was given has none."""
+    """Parameters with their errors; what was given has none, and of what sits at its bound it does not hold."""
 
     def one(p):
-        if p.get("given"):
-            return " ".join(filter(None, (plain(p["value"], 4), unit_text(p["unit"]), "(given)")))
+        said = "(given)" if p.get("given") else "(at its bound)" if p.get("at_bound") else ""
+        if said:
+            return " ".join(filter(None, (plain(p["value"], 4), unit_text(p["unit"]), said)))
         return f"{tables.to_error(p['value'], p['stderr'])} ± {plain(p['stderr'], 2)} {unit_text(p['unit'])}".strip()
 
     return "; ".join(f"{n} = {one(p)}" for n, p in parameters.items())

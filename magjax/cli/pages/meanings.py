@@ -99,6 +99,7 @@ INNER = {
     "effects[].parameters.*.stderr": "standard error; 0 of what was given",
     "effects[].parameters.*.unit": "unit of both",
     "effects[].parameters.*.given": "true, and there only where it was given and not fitted: the range of a sensor's curve",
+    "effects[].parameters.*.at_bound": "true, and there only where it sits at its bound: the standard error does not hold",
     "effects[].confidence": "0 .. 1, against the rivals that were fitted",
     "effects[].shifts": "what the base had got wrong to hide it",
     "effects[].shifts.*": "base parameter -> [before, after]",
