@@ -41,7 +41,7 @@ class Beginning:
         if found := hum_on_harmonics(task, self.adopted, fit, candidates):
             cleaned, hum, freed = found
             return cleaned, [*self.adopted, hum], freed
-        return heat_on_harmonics(task, self.adopted, fit)
+        return heat_on_harmonics(task, self.adopted, fit, candidates)
 
     def from_plain(self, plain, candidates):
         """From recordings without hum or heat that shows in what the plain fit leaves; None where there is none."""

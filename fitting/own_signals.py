@@ -19,6 +19,7 @@ from .record_level import (
     hum_between,
     hum_is_seen,
     hum_of,
+    in_its_times,
     lone_drifts,
     pulsation_of,
     record_effects,
@@ -29,7 +30,7 @@ from .record_level import (
 from .rows import DRIFTS
 from .screen import screened
 from .setup import spectra_of
-from .verdict import Z_THRESHOLD
+from .verdict import HALF, Z_THRESHOLD
 
 RECORD_Z = 8.0
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
@@ -39,6 +40,7 @@ MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the 
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics, or a rod's breathing with the heat, must take
 HEAT_PASSES, NOTHING_LEFT = 2, 2.0  # fits that find the rate of a pulsation, and z of what they may leave of it
 HEAT_RATE = 0.5  # of the pulsation, in units of the drift's: what cools fast breathes and drifts no more
+LIKE_DRIFT = 3.0  # the same up to which the drift speaks for the pulsation: it must take but half of a misfit then, if no effect scores as high
 
 
 def drifts_of_one(recordings, spectra, bench):
@@ -56,15 +58,22 @@ def record_level(recordings, spectra, bench, choices):
     """Drift, heat and hum, scored between the harmonics: (adopted with their rivals, the recordings without them)."""
     adopted = []
     for _ in range(0 if bench.quasistatic or bench.output != "displacement" else 2):
-        known = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
-        found = [e for e in record_effects(recordings, spectra) if e.name not in known]
+        held = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
+        found = [e for e in record_effects(recordings, spectra) if e.name not in held]
         best = found[0]
         if abs(best.z) < RECORD_Z:
             break
-        rivals = [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z)]
-        adopted.append((best, rivals))
-        recordings = remove_record_effect(recordings, best, bench.output)
-        spectra = spectra_of(recordings, bench, choices.harmonics)
+        without = remove_record_effect(recordings, best, bench.output)
+        cleaned = spectra_of(without, bench, choices.harmonics)
+        if best.name == "thermal_drift" and "tau" in best.shapes:
+            # by the noise that is left: what drifts adds to it
+            known = [dataclasses.replace(s, noise=c.noise) for s, c in zip(spectra, cleaned, strict=True)]
+            if better := in_its_times(best, recordings, known):
+                best, found = better, [better, *(e for e in record_effects(recordings, known) if e.name not in held | {best.name})]
+                without = remove_record_effect(recordings, best, bench.output)
+                cleaned = spectra_of(without, bench, choices.harmonics)
+        adopted.append((best, [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z)]))
+        recordings, spectra = without, cleaned
     return adopted, recordings
 
 
@@ -87,9 +96,10 @@ def hum_on_harmonics(task, adopted, base, candidates=()):
     return cleaned, (effect, []), freed
 
 
-def heat_on_harmonics(task, adopted, base):
+def heat_on_harmonics(task, adopted, base, candidates=()):
     """Heat that shows between the harmonics as a drift pulses with the square of the current, too, and each recording begins as
-    warm as it is: adopted if both, or the pulsation alone, take most of what `base` leaves, at no less than the drift's rate.
+    warm as it is: adopted if both, or the pulsation alone, take most of what `base` leaves, at no less than the drift's rate; or
+    half of it at about that rate, where it scores above all `candidates`: something else is missing, too.
     Returns the task without them, all that was adopted, and its fit; None elsewhere.
     """
     bench, held = task.bench, {k for e, _ in adopted for k in ("zeros", "pulsation") if e.shapes.get(k)}
@@ -100,13 +110,15 @@ def heat_on_harmonics(task, adopted, base):
     if heat is None or not base.chi2_per_sample > SILENT_CHI2:
         return None
     excess = excess_of(base)
+    highest = max((abs(c.z) for c in candidates), default=np.inf)
     for zeros in (False, True):
         score = heat_score(base.problem, base.refined, zeros)
-        least = HEAT_RATE * abs(heat.amplitude)
-        if abs(score.z) < Z_THRESHOLD or score.fall < MOST_OF_IT * excess or abs(score.rate) < least:
+        like_drift = HEAT_RATE < score.rate / heat.amplitude < LIKE_DRIFT and abs(score.z) > highest
+        most, nearly = (HALF, HALF) if like_drift else (MOST_OF_IT, NEARLY_ALL)
+        if abs(score.z) < Z_THRESHOLD or score.fall < most * excess or abs(score.rate) < HEAT_RATE * abs(heat.amplitude):
             continue
         cleaned, more, freed = _without_heat(task, base, score)
-        if freed.chi2_per_sample < least_excess(freed) or chi2_of(freed) < chi2_of(base) - NEARLY_ALL * excess:
+        if freed.chi2_per_sample < least_excess(freed) or chi2_of(freed) < chi2_of(base) - nearly * excess:
             return cleaned, [*drifts, *((e, []) for e in more)], freed
     return None
 

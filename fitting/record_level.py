@@ -13,10 +13,12 @@ from magjax.words import sized
 from .spectra import ON_LINE, evaluate_lines, fit_lines, reduce_recording, with_noise
 
 MAINS = (50.0, 60.0)
-HUM_TONES = 3
+HUM_TONES, MORE_TONES = 3, (4, 5, 6, 7)  # multiples of the mains by which hum is told, and those that it may have besides
 CLEAR, LEAST_SHOWN = 25.0, 0.1  # chi2 that a signal of a size would take between the harmonics, and the share that must show
 STANDS_OUT = 2.5  # times the largest of the six harmonics beside it, that a hum on a harmonic of the drive is
 MOST_SHOW = 0.5  # of the recordings where a signal would be clear, more of which must show it, or deny it
+HEAT_TIMES = (0.3, 3.0, 30.0)  # s, by which a rod may warm
+NODE_TIMES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # the same of two nodes
 LONE_GAIN = 60.0  # fall of chi2 from which a drift of one record may be its alone
 SETTLING = (0.04, 0.15)  # of the record's length: times with which such a record may settle
 AS_ALIKE = 1.02  # spread of drifts per heat in units of that of the drifts, up to which they may as well be heat
@@ -40,13 +42,45 @@ def record_columns(recordings, spectra):
     rows = []
     times = [s.dt * np.arange(s.samples) for s in spectra]
     rows.append(("zero_drift", {}, [t for t in times]))
-    for tau in (0.3, 3.0, 30.0):
-        heat = []
-        for recording, t in zip(recordings, times, strict=True):
-            drive = np.asarray(recording.channels[recording.drive])
-            heat.append(np.mean(drive**2) * tau * (1 - np.exp(-t / tau)))
-        rows.append(("thermal_drift", {"tau": tau}, heat))
+    for tau in HEAT_TIMES:
+        rows.append(("thermal_drift", {"tau": tau}, heat_columns(recordings, spectra, {"tau": tau})))
     return rows
+
+
+def heat_columns(recordings, spectra, shapes) -> list:
+    """What the mean heat of each recording adds to it at a unit rate at its start: by one time, `tau`, or several nodes, `taus`, with
+    their `shares` of that rate."""
+    parts = zip(shapes.get("taus", (shapes.get("tau"),)), shapes.get("shares", (1.0,)), strict=True)
+    columns = [0.0 for _ in spectra]
+    for tau, share in parts:
+        for n, (recording, s) in enumerate(zip(recordings, spectra, strict=True)):
+            power = np.mean(np.asarray(recording.channels[recording.drive]) ** 2)
+            columns[n] = columns[n] + share * power * tau * (1 - np.exp(-s.dt * np.arange(s.samples) / tau))
+    return columns
+
+
+def in_its_times(heat, recordings, spectra) -> RecordEffect | None:
+    """A drift by heat with a time that clearly serves better than its own, or with two: winding and rod warm each in its time; None
+    where its own serves as well."""
+    parts = {tau: [_between(s, c) for s, c in zip(spectra, heat_columns(recordings, spectra, {"tau": tau}), strict=True)] for tau in NODE_TIMES}
+
+    def fitted(*taus):
+        G, g = 0.0, 0.0
+        for reduced in zip(*(parts[tau] for tau in taus), strict=True):
+            G = G + np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
+            g = g + np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
+        rates = np.linalg.lstsq(G, g, rcond=1e-12)[0]
+        return float(rates @ g), rates, taus
+
+    best = max(map(fitted, NODE_TIMES), key=lambda row: row[0])
+    pairs = [fitted(a, b) for a in NODE_TIMES for b in NODE_TIMES if a < b]
+    both = max((row for row in pairs if len(set(np.sign(row[1]))) == 1), key=lambda row: row[0], default=best)
+    fall, rates, taus = both if both[0] > best[0] + CLEAR else best
+    if fall < fitted(heat.shapes["tau"])[0] + CLEAR:
+        return None
+    rate, z = float(np.sum(rates)), float(np.sqrt(fall))
+    shapes = {"taus": taus, "shares": tuple(float(x) / rate for x in rates)}
+    return RecordEffect(heat.name, z, rate, abs(rate) / z, shapes, tuple(heat_columns(recordings, spectra, shapes)))
 
 
 def record_effects(recordings, spectra) -> list[RecordEffect]:
@@ -61,7 +95,7 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
         z, amplitude = top / np.sqrt(bottom), top / bottom
         if name not in found or abs(z) > abs(found[name].z):
             found[name] = RecordEffect(name, float(z), float(amplitude), float(1 / np.sqrt(bottom)), shapes, tuple(columns))
-    if own := _own_drifts(spectra, found["zero_drift"].z):
+    if own := _own_drifts(spectra, max(abs(e.z) for e in found.values())):
         found["zero_drift"] = own
         if may_be_heat(own, spectra):
             found["thermal_drift"] = by_heat(own, spectra)
@@ -73,10 +107,30 @@ def hum_between(spectra) -> RecordEffect:
     """Hum between the harmonics, of the mains frequency that shows more; z is 0 where most recordings deny it."""
     rows = []
     for f in MAINS:
-        z, tones, fits = _hum(spectra, f)
+        z, tones, fits = _hum(spectra, multiples(f))
         z = float(z) if hum_is_seen(spectra, tones) else 0.0
         rows.append(RecordEffect("mains_hum", z, tones[0][1], tones[0][1] / max(z, 1.0), {"f": f, "tones": tones}, tuple(fits)))
-    return max(rows, key=lambda e: e.z)
+    best = max(rows, key=lambda e: e.z)
+    return _with_more_tones(spectra, best) if best.z**2 > CLEAR else best
+
+
+def multiples(mains, orders=()) -> list[float]:
+    """Frequencies of the tones by which hum is told, and of further `orders`, Hz."""
+    return [k * mains for k in (*range(1, HUM_TONES + 1), *orders)]
+
+
+def _with_more_tones(spectra, hum) -> RecordEffect:
+    """The same with the higher multiples of the mains that show clearly beside those by which it was told."""
+    f, orders, best = hum.shapes["f"], [], None
+    reached = _hum(spectra, multiples(f))[0]
+    for order in MORE_TONES:
+        z, tones, fits = _hum(spectra, multiples(f, (*orders, order)))
+        if z**2 > reached**2 + CLEAR:
+            orders.append(order)
+            reached, best = z, (tones, tuple(fits))
+    if best is None:
+        return hum
+    return dataclasses.replace(hum, shapes={**hum.shapes, "tones": best[0]}, columns=best[1])
 
 
 def mean_heat(spectra) -> np.ndarray:
@@ -132,7 +186,7 @@ def zeros_of(spectra, z: float, zeros, errors, adopted=()) -> list[RecordEffect]
 
 def hum_of(spectra, z: float, tones) -> RecordEffect:
     """Hum known from harmonics that it falls on (`on_lines.hum_score`), joined to what shows of it between the others."""
-    between, shown, fits = _hum(spectra, tones[0][0], [a for _, a in tones])
+    between, shown, fits = _hum(spectra, *zip(*tones, strict=True))
     both = tuple((f, max(a, b)) for (f, a), (_, b) in zip(tones, shown, strict=True))
     z = float(np.hypot(z, between))
     return RecordEffect("mains_hum", z, both[0][1], both[0][1] / max(z, 1.0), {"f": tones[0][0], "tones": both}, tuple(fits))
@@ -210,7 +264,7 @@ def _combination(reduced, sizes=None):
 
 
 def _own_drifts(spectra, common: float) -> RecordEffect | None:
-    """Drift of each record by itself, where that serves better (BIC) than the `common` rate, scored by z; None elsewhere."""
+    """Drift of each record by itself, where that serves better (BIC) than what scores `common` by one rate; None elsewhere."""
     gains, fits = zip(*(drift_of(s) for s in spectra), strict=True)
     extra, count = 2 * len(spectra), sum(s.samples for s in spectra)
     # short records show none; a hum looks like one in them alone
@@ -224,18 +278,17 @@ def _own_drifts(spectra, common: float) -> RecordEffect | None:
     return RecordEffect("zero_drift", z, rate, float(np.std(ends) / np.sqrt(len(ends))), {"own": True}, fits)
 
 
-def _hum(spectra, mains, amplitudes=None):
-    """Hum of one mains frequency and its first harmonics, a phase of its own in each record: (z, tones, fits).
+def _hum(spectra, frequencies, amplitudes=None):
+    """Hum of tones, Hz, the first that of the mains, with phases of their own in each record: (z, tones, fits).
 
     `tones`: (frequency, largest amplitude over the records) of each; a tone that falls on a harmonic of the drive cannot be
     told from the reading there, and a record shorter than two of its periods tells no tone from slow noise: it takes no
     part in the score, and its own tones are held to the size of the others', or to `amplitudes` where they are known.
     """
     longest = max(s.samples * s.dt for s in spectra)
-    frequencies = [k * mains for k in range(1, HUM_TONES + 1)]
-    gain, number, power, fits = 0.0, 0, np.zeros(HUM_TONES), {}
+    gain, number, power, fits = 0.0, 0, np.zeros(len(frequencies)), {}
     for s in sorted(spectra, key=lambda s: -s.samples * s.dt):
-        long = s.samples * s.dt >= min(2 / mains, longest * 0.999)
+        long = s.samples * s.dt >= min(2 / frequencies[0], longest * 0.999)
         parts, kinds = _tones(s, frequencies)
         if not parts:
             fits[id(s)] = np.zeros(s.samples)
@@ -319,11 +372,13 @@ def remove_from_checks(recordings, adopted, bench):
         for effect in between if recording.frequency() is not None else ():
             spectra = with_noise([reduce_recording(recording, bench.drive, bench.output, columns=bench.columns)])
             if effect.name == "mains_hum":
-                columns = tuple(_hum(spectra, effect.shapes["f"], [a for _, a in effect.shapes["tones"]])[2])
+                columns = tuple(_hum(spectra, *zip(*effect.shapes["tones"], strict=True))[2])
             elif effect.shapes.get("own"):
                 columns = (drift_of(spectra[0])[1],)
             elif effect.shapes.get("pulsation"):
                 columns = (pulsation(spectra[0]),)
+            elif effect.name == "thermal_drift":
+                columns = tuple(heat_columns([recording], spectra, effect.shapes))
             else:
                 same = [c for n, shapes, c in record_columns([recording], spectra) if (n, shapes) == (effect.name, effect.shapes)]
                 columns = tuple(same[0])

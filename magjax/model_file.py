@@ -28,7 +28,7 @@ def load_model(folder):
 
 
 def _model(content):
-    from .effects import CLASSES
+    from .effects import form_of
     from .effects.learned_term import LearnedTerm
 
     stated = dict(content["bench"])
@@ -45,10 +45,10 @@ def _model(content):
     hysteresis = Preisach(np.asarray(plane["masses"]), plane["low"], plane["high"], plane["offset"], rest=plane.get("rest"))
     hysteresis = eqx.tree_at(lambda h: h.history, hysteresis, jnp.asarray(plane["history"], dtype=float))
     actuator = eqx.tree_at(lambda a: a.hysteresis, actuator, hysteresis)
-    for name in content["effects"]:
-        effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else CLASSES[name]()
-        actuator = actuator.with_effect(effect)
     stated = content["parameters"]
+    for name in content["effects"]:
+        effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else form_of(name, stated)()
+        actuator = actuator.with_effect(effect)
     known = actuator.parameters()
     # shapes have a default, which leaves a law as it was before it had them
     if missing := [n for n, (_, info) in known.items() if n not in stated and info.null is None and not info.shape]:

@@ -9,6 +9,7 @@ import pytest
 from fitting.result import model_as_dict
 from magjax.bench import built_in_benches, load_bench
 from magjax.cli import main
+from magjax.effects.field_diffusion import DiffusionModes
 from magjax.errors import ConfigurationError
 from magjax.model_file import load_model
 from magjax.preisach import Preisach
@@ -110,6 +111,15 @@ def test_a_start_may_be_a_history_of_fields(tmp_path):
     (tmp_path / "model.json").write_text(json.dumps(model_as_dict(actuator, bench)))
     read, again = load_model(tmp_path)
     assert again == bench and np.array_equal(np.asarray(simulate(read, drive, 1e-4).magnetization), a)
+
+
+def test_a_law_is_read_in_the_form_that_was_written(tmp_path):
+    """The modes of a solid rod have a time, its shells have none."""
+    bench = load_bench("aa-050h")
+    actuator = bench.actuator().with_effect(DiffusionModes(kappa=0.7, tau=2e-4))
+    (tmp_path / "model.json").write_text(json.dumps(model_as_dict(actuator, bench)))
+    (effect,) = load_model(tmp_path)[0].effects
+    assert type(effect) is DiffusionModes and (float(effect.kappa), float(effect.tau)) == (0.7, 2e-4)
 
 
 def test_a_model_that_does_not_hold_is_told_with_its_file(tmp_path):

@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import jv
 
 import magjax.effects as effects
 from magjax.chain import BLOCKS, Timeline, newton
 from magjax.chain.march import magnetize
 from magjax.chain.mechanics import Mechanics
 from magjax.effects import CATALOGUE, AbstractEffect
+from magjax.effects.field_diffusion import ZEROS, DiffusionModes
 from magjax.simulate import run_chain, simulate
 from tests.test_simulate import actuator, sine
 
@@ -22,6 +24,7 @@ Rates = collections.namedtuple("Rates", "flux_rate")
 N = 160
 CURRENT = jnp.asarray(sine(N, 0.7))
 DT = 1 / (80 * N)
+FORMS = [form for kind in CATALOGUE for form in kind.forms]
 named = pytest.mark.parametrize("kind", CATALOGUE, ids=lambda k: k.name)
 SAMPLE = ("amplifier_lag", "excess_loss", "strain_hysteresis")  # before, in and behind the step
 
@@ -55,7 +58,11 @@ def test_at_their_nulls_all_of_them_together_change_nothing():
     assert np.abs(np.asarray(reading(act)) - base).max() <= 2e-15 * np.abs(base).max()
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=[] if k.name in SAMPLE else pytest.mark.long, id=k.name) for k in CATALOGUE])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(k, marks=[] if k.name in SAMPLE else pytest.mark.long, id=k.name) for k in CATALOGUE]
+    + [pytest.param(k, id=f"{k.name}: {k.__name__}") for k in FORMS],
+)
 def test_null_gradient_and_batch(kind):
     act = actuator(20)
     extended = act.with_effect(kind())
@@ -85,6 +92,54 @@ def test_null_gradient_and_batch(kind):
     assert np.abs(number).max() > 0
     assert np.abs(slopes[0] - number).max() < 2e-4 * np.abs(number).max()
     assert found[3] == pytest.approx(np.asarray(reading(extended.replace({name: value}), 0.5 * CURRENT)), abs=1e-16, rel=1e-9)
+
+
+def test_the_modes_of_a_solid_rod_are_those_of_its_bessel_functions():
+    """Applied field less mean B over mu is k s mean B F(s), and H / mean B = x J0(x) / (2 J1(x)) at the surface, x^2 = -8 s T with the
+    mean lag T; the modes beyond the sixth follow at once."""
+    act = actuator(20).replace({"coil.R_eddy": 60.0}).with_effect(DiffusionModes(kappa=1.0, tau=6e-4))
+    T = 6e-4 * ZEROS[0] ** 2 / 8
+    found, n = run_chain(act, CURRENT, DT, 6, 8), np.arange(1, 6)
+    opposing = np.fft.rfft(np.asarray(act.coil.applied_field(found.current) - found.field))[n]
+    late = opposing / (float(act.coil.loss) * 2j * np.pi * 80.0 * n * np.fft.rfft(np.asarray(found.flux_density))[n])
+    s = 2j * np.pi * 80.0 * n
+    x = np.sqrt(-8 * s * T)
+    whole = (x * jv(0, x) / (2 * jv(1, x)) - 1) / (s * T)
+    assert np.abs(late - whole)[::2].max() < 0.02 and np.abs(whole)[4] < 0.8
+    half = run_chain(act.replace({"effects.field_diffusion.kappa": 0.5}), CURRENT, DT, 6, 8)
+    opposing = np.fft.rfft(np.asarray(act.coil.applied_field(half.current) - half.field))[n]
+    part = opposing / (float(act.coil.loss) * 2j * np.pi * 80.0 * n * np.fft.rfft(np.asarray(half.flux_density))[n])
+    assert np.abs(part - (1 + late) / 2)[::2].max() < 0.01
+
+
+def test_a_form_of_a_law_is_told_by_its_parameters():
+    stated = {"effects.field_diffusion.kappa": 1.0, "effects.field_diffusion.tau": 1e-4, "effects.second_mode.gain": 0.1}
+    assert effects.form_of("field_diffusion", stated) is DiffusionModes and effects.form_of("field_diffusion", {}) is effects.FieldDiffusion
+    assert effects.form_of("second_mode", stated) is effects.SecondMode
+    assert all(form.name == kind.name and form.block == kind.block for kind in CATALOGUE for form in kind.forms)
+
+
+def test_a_strain_that_lags_along_the_path_of_m():
+    """Plays on M/M_s of a closed loop, what they lag added to the free displacement, not squared with M."""
+    rod, line = actuator(20).magnetostriction, Timeline(DT, N, True)
+    m = 0.4 + 0.3 * np.sin(2 * np.pi * np.arange(N) / N)
+    u = jnp.asarray(float(rod.reach) * m**2)
+
+    def strained(**how):
+        return np.asarray(effects.StrainHysteresis(share=0.1, width=0.2, **how).strain(u, jnp.asarray(m) * rod.M_s, None, line, actuator(20)))
+
+    late = np.zeros(N)
+    for width in (0.02, 0.06, 0.12, 0.2):
+        state = m[0]
+        for _ in range(2):
+            path = []
+            for now in m:
+                state = min(max(state, now - width), now + width)
+                path.append(state)
+        late += np.asarray(path) / 4
+    assert strained(of_m=1.0) - np.asarray(u) == pytest.approx(0.1 * float(rod.reach) * (late - m), abs=1e-15)
+    half = (strained(of_m=1.0) + strained()) / 2
+    assert strained(of_m=0.5) == pytest.approx(half, abs=1e-15) and np.abs(half - strained()).max() > 1e-7
 
 
 def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():

@@ -1,20 +1,26 @@
 """Heat of the coil: it drifts through a record, pulses with the square of the current, and each record begins as warm as it is."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fitting import own_signals
+from fitting.attribute import excess_of
 from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
+from fitting.on_lines import HeatScore
 from fitting.own_signals import heat_on_harmonics, record_level
+from fitting.record_level import RecordEffect, remove_from_checks
 from fitting.report.evidence import model_misfit
 from fitting.setup import Choices, spectra_of
 from fitting.task import Task
 from magjax.bench import load_bench
 from magjax.chain import Timeline
 from magjax.effects import CATALOGUE, ThermalDrift
+from magjax.recording import Recording
 
 BENCH = load_bench("aa-050h")
 DRIVES = ((8, 0.8, 0.1), (12, 0.5, -0.2), (20, 0.65, 0.2), (35, 0.4, -0.3), (200, 0.6, 0.1))
@@ -75,6 +81,59 @@ def test_what_pulses_with_the_heat_is_heat_and_no_zero_that_drifts():
     for misfit, spectrum in zip(model_misfit(freed), freed.problem.spectra, strict=True):  # drawn at the level that each has
         assert 2 * np.sum(np.abs(misfit) ** 2) < (0.5 * spectrum.noise_rms) ** 2
     assert all(r.residual_rms < 1.2 * r.noise_rms for r in freed.recordings)
+
+
+class AsScored:
+    """A fit that scores a pulsation at a rate, and leaves some."""
+
+    chi2_per_sample, data_count, actuator, problem, refined = 2.35, 700, None, None, None
+
+
+@pytest.mark.parametrize(
+    ("z", "rate", "fall", "left", "found"),
+    [(25.5, 4.5e-6, 0.62, 1.5, True), (9.0, 4.5e-6, 0.62, 1.5, False), (25.5, 1.5e-5, 0.62, 1.5, False), (25.5, -4.5e-6, 0.62, 1.5, False),
+     (25.5, 4.5e-6, 0.4, 1.5, False), (25.5, 4.5e-6, 0.62, 1.8, False), (9.0, 4.5e-6, 0.85, 1.05, True)],
+    ids=["it scores highest", "an effect scores higher", "far faster than the drift", "the other way", "less than half", "half of it left", "all but nothing else"],
+)  # fmt: skip
+def test_heat_pulses_beside_what_else_is_missing(monkeypatch, z, rate, fall, left, found):
+    """A quartic law beside a rod that warms: its breathing took 0.62 of the misfit at the drift's rate, and 0.8 was asked for."""
+    base, freed = AsScored(), SimpleNamespace(chi2_per_sample=left, data_count=700)
+    drift = RecordEffect("thermal_drift", 36.0, 3.3e-6, 1e-7, {"tau": 3.0})
+    score = HeatScore(z, rate, 1e-7, np.zeros(0), np.zeros(0), fall * excess_of(base))
+    monkeypatch.setattr(own_signals, "heat_score", lambda *a: score)
+    monkeypatch.setattr(own_signals, "_as_heat", lambda e, rivals, spectra: (e, []))
+    monkeypatch.setattr(own_signals, "_without_heat", lambda task, base, score: (task, [], freed))
+    monkeypatch.setattr(own_signals, "least_excess", lambda fit: 1.1)
+    monkeypatch.setattr(AsScored, "spectra", (), raising=False)
+    task = SimpleNamespace(bench=BENCH)
+    answer = heat_on_harmonics(task, [(drift, [])], base, [SimpleNamespace(z=-10.6)])
+    assert (answer is not None) == found
+    if fall < 0.8:  # beside the effects of a fit nothing else may be missing
+        assert heat_on_harmonics(task, [(drift, [])], base) is None
+
+
+@pytest.mark.parametrize(
+    ("nodes", "taus"),
+    [(((4.2e-6, 1.0), (8e-7, 10.0)), (1.0, 10.0)), (((5e-6, 1.0),), (1.0,)), (((3.5e-6, 3.0),), (3.0,)), (((5e-6, 1.0), (2e-6, 10.0)), (1.0, 30.0))],
+    ids=["two nodes", "one", "one of the first times", "no drifts of their own"],
+)  # fmt: skip
+def test_heat_drifts_in_the_times_of_winding_and_rod(nodes, taus):
+    """A winding of 1 s beside a rod of 10 s was a drift of 3 s and a sensor's zero that drifted back, or drifts of each record by
+    itself, straight and by the root of time, which left twice the noise and more."""
+    rng, rows = np.random.default_rng(3), []
+    for f, amplitude in ((50, 0.5), (8, 0.5), (30, 0.8), (20, 0.5), (15, 0.8), (2, 0.8), (3, 0.6)):
+        t = np.arange(500 * (5 if f == 2 else 4)) / (500 * f)
+        y = 1e-5 * np.sin(2 * np.pi * f * t - 0.2) + 3.6e-8 * rng.standard_normal(len(t))
+        y = y + sum(rate * amplitude**2 / 2 * tau * (1 - np.exp(-t / tau)) for rate, tau in nodes)
+        rows.append(Recording(t, {"current": amplitude * np.sin(2 * np.pi * f * t), "displacement": y}, name=f"{f} Hz"))
+    adopted, cleaned = record_level(rows, spectra_of(rows, BENCH), BENCH, Choices())
+    (heat, _), *others = adopted
+    assert heat.name == "thermal_drift" and not others
+    assert heat.shapes.get("taus", (heat.shapes.get("tau"),)) == taus
+    assert heat.amplitude == pytest.approx(sum(rate for rate, _ in nodes), rel=0.05)
+    assert all(s.noise_rms == pytest.approx(3.6e-8, rel=0.1) for s in spectra_of(cleaned, BENCH))
+    for one, other in zip(remove_from_checks(rows, [heat], BENCH), cleaned, strict=True):
+        assert one.channels["displacement"] == pytest.approx(other.channels["displacement"], abs=1e-15)
 
 
 @pytest.mark.long

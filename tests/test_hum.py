@@ -10,9 +10,10 @@ from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.fit import fit
 from fitting.on_lines import hum_score
-from fitting.record_level import hum_between, hum_is_seen
+from fitting.record_level import hum_between, hum_is_seen, remove_from_checks, remove_record_effect
 from fitting.report.evidence import of_checks
 from fitting.setup import Choices, spectra_of
+from fitting.spectra import line_deviations
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 from magjax.recording import Recording
@@ -52,6 +53,27 @@ def test_what_one_recording_shows_alone_is_no_hum():
     """It would have the same size in all of them."""
     base = fit(recorded(2 * HUM, only=25), BENCH, refine=False)
     assert hum_score(base.problem, base.refined) == (0.0, ())
+
+
+@pytest.mark.parametrize(("fifth", "orders"), [(0.25, (1, 2, 3, 5)), (0.0, (1, 2, 3))], ids=["a fifth multiple", "none"])
+def test_hum_has_the_multiples_that_show(fifth, orders):
+    """A fifth multiple was left in the reading: on the tenth harmonic of a 30 Hz loop it was physics that no effect explains."""
+    rng, rows = np.random.default_rng(6), []
+    for row in recorded(drives=((17, 0.8, 0.1), (29, 0.6, 0.1), (30, 0.5, -0.2), (70, 0.5, 0.1))):
+        phases = rng.uniform(0, 2 * np.pi, 2)
+        wave = 5 * HUM * (np.sin(120 * np.pi * row.time + phases[0]) + fifth * np.sin(600 * np.pi * row.time + phases[1]))
+        rows.append(dataclasses.replace(row, channels={**row.channels, "displacement": row.channels["displacement"] + wave}))
+    spectra = spectra_of(rows, BENCH)
+    found = hum_between(spectra)
+    assert found.shapes["f"] == 60.0 and [f / 60 for f, _ in found.shapes["tones"]] == list(orders)
+    assert found.shapes["tones"][-1][1] == pytest.approx(5 * fifth * HUM, abs=2e-8)
+    cleaned = spectra_of(remove_record_effect(rows, found, "displacement"), BENCH)
+    assert all(s.noise_rms < 1.3 * np.sqrt(np.mean(q.residue**2)) for s, q in zip(cleaned, spectra_of(recorded(drives=DRIVES[:1]), BENCH), strict=False))
+    again = remove_from_checks(rows[:1], [found], BENCH)[0]
+    left = np.std(again.channels["displacement"] - rows[0].channels["displacement"])
+    assert left == pytest.approx(5 * HUM * np.sqrt((1 + fifth**2) / 2), rel=0.05)
+    deviations = line_deviations(cleaned[2], cleaned[2].noise)  # of the loop of 30 Hz
+    assert (deviations[10] > 3 * deviations[9]) == (fifth > 0)
 
 
 def test_hum_must_show_between_the_harmonics_where_it_can():

@@ -74,4 +74,10 @@ def refuse_unknown(names) -> None:
             raise ConfigurationError(f'no effect "{name}"; the catalogue has {", ".join(CLASSES)}')
 
 
-__all__ = ["CATALOGUE", "CLASSES", "AbstractEffect", "Trial", "refuse_unknown"]
+def form_of(name, parameters) -> type[AbstractEffect]:
+    """The form of an effect's law that has the `parameters`, by their names in a model (effects.NAME.PARAMETER); the first where none has."""
+    own = {n.rsplit(".", 1)[1] for n in parameters if n.startswith(f"effects.{name}.")}
+    return next((c for c in (CLASSES[name], *CLASSES[name].forms) if own <= set(c.parameters())), CLASSES[name])
+
+
+__all__ = ["CATALOGUE", "CLASSES", "AbstractEffect", "Trial", "form_of", "refuse_unknown"]

@@ -44,6 +44,7 @@ class AbstractEffect(eqx.Module):
     data), `in_step` (solved inside the step of (4)), `slow` (its state takes longer than
     a few periods: `settled` leads it to where it repeats), `record_level` (acts on the whole record, not period by period),
     `amplitude` (the parameter whose null removes the effect), `shells` (into so many the rod is cut, see chain.shells; 0: not),
+    `forms` (classes of the same name with another form of the law, which a fit may reach by `elsewhere`),
     `magnetic` (it means nothing in a stack under voltage, as all of the coil and of the magnetostriction do).
     """
 
@@ -57,6 +58,7 @@ class AbstractEffect(eqx.Module):
     slow: ClassVar[bool] = False
     record_level: ClassVar[bool] = False
     shells: ClassVar[int] = 0
+    forms: ClassVar[tuple] = ()
     magnetic: ClassVar[bool] = False
 
     def with_amplitude(self, value):

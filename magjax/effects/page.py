@@ -30,10 +30,12 @@ def page() -> str:
             "",
         ]
         lines += ["| parameter | unit | null | typical | meaning |", "|---|---|---|---|---|"]
-        for name, info in effect.parameters().items():
+        rows = [(n, info, "") for n, info in effect.parameters().items()]
+        rows += [(n, info, " (by modes)") for form in effect.forms for n, info in form.parameters().items() if n not in effect.parameters()]
+        for name, info, where in rows:
             null = "shape" if info.shape else f"{info.null:g}" if info.null is not None else ""
             typical = f"{info.typical[0]:g} .. {info.typical[1]:g}" if info.typical else ""
-            lines.append(f"| {name} | {info.unit} | {null} | {typical} | {info.meaning} |")
+            lines.append(f"| {name} | {info.unit} | {null} | {typical} | {info.meaning}{where} |")
     return "\n".join(lines) + "\n"
 
 
