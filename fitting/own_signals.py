@@ -32,7 +32,8 @@ from .screen import screened
 from .setup import spectra_of
 from .verdict import HALF, Z_THRESHOLD
 
-RECORD_Z = 8.0
+HUM_Z = 7.0  # what is no hum scored 5.3 at most, of 180 sets of recordings
+DRIFT_Z = 6.0  # no drift: 3.4
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
 NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
@@ -49,7 +50,7 @@ def drifts_of_one(recordings, spectra, bench):
     if bench.quasistatic or bench.output != "displacement":
         return recordings, []
     hum = hum_between(spectra)
-    if hum.z > RECORD_Z:
+    if hum.z > HUM_Z:
         spectra = spectra_of(remove_record_effect(recordings, hum, bench.output), bench)
     return without_lone_drifts(recordings, lone_drifts(spectra), bench.output)
 
@@ -61,7 +62,7 @@ def record_level(recordings, spectra, bench, choices):
         held = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
         found = [e for e in record_effects(recordings, spectra) if e.name not in held]
         best = found[0]
-        if abs(best.z) < RECORD_Z:
+        if abs(best.z) < (HUM_Z if best.name == "mains_hum" else DRIFT_Z):
             break
         without = remove_record_effect(recordings, best, bench.output)
         cleaned = spectra_of(without, bench, choices.harmonics)

@@ -7,9 +7,9 @@ import pytest
 
 from fitting.diagnosis import Diagnosis
 from fitting.floors import data_problem
-from fitting.own_signals import drifts_of_one
+from fitting.own_signals import drifts_of_one, record_level
 from fitting.record_level import lone_drifts, record_effects, remove_from_checks, remove_record_effect
-from fitting.setup import spectra_of
+from fitting.setup import Choices, spectra_of
 from magjax.bench import load_bench
 from magjax.recording import Recording
 
@@ -43,6 +43,16 @@ def test_a_common_rate_is_one_drift():
     best = next(e for e in scored(records(lambda t: 2e-6 * t)) if e.name == "zero_drift")
     assert best.z > 10 and not best.shapes
     assert best.amplitude == pytest.approx(2e-6, abs=4 * best.stderr) and best.stderr < 2e-7
+
+
+@pytest.mark.parametrize(("rate", "found"), [(1.5e-7, True), (5e-8, False)])
+def test_a_weak_drift_is_taken_out_where_nothing_else_scores_so_high(rate, found):
+    """A rod's warming of 0.2 % scored 6.6 and stayed in the readings; what does not drift scores 3.4 at most."""
+    runs = records(lambda t: rate * t)
+    z = max(abs(e.z) for e in scored(runs))
+    assert 6 < z < 8 if found else z < 5.5
+    adopted, _ = record_level(runs, spectra_of(runs, BENCH), BENCH, Choices())
+    assert [{e.name, *(r.name for r in rivals)} for e, rivals in adopted] == ([{"thermal_drift", "zero_drift"}] if found else [])
 
 
 @pytest.mark.parametrize("shape", [lambda u: u, np.sqrt], ids=["straight", "root"])
