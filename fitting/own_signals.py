@@ -33,7 +33,7 @@ from .setup import spectra_of
 from .verdict import HALF, Z_THRESHOLD
 
 HUM_Z = 7.0  # what is no hum scored 5.3 at most, of 180 sets of recordings
-DRIFT_Z = 6.0  # no drift: 3.4
+DRIFT_Z = 6.0, 8.0  # no drift: 3.4; beside a drift that was taken out, what its form left scored 6.8
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
 NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
@@ -62,18 +62,19 @@ def record_level(recordings, spectra, bench, choices):
         held = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
         found = [e for e in record_effects(recordings, spectra) if e.name not in held]
         best = found[0]
-        if abs(best.z) < (HUM_Z if best.name == "mains_hum" else DRIFT_Z):
+        if abs(best.z) < (HUM_Z if best.name == "mains_hum" else DRIFT_Z[bool(adopted)]):
             break
         without = remove_record_effect(recordings, best, bench.output)
         cleaned = spectra_of(without, bench, choices.harmonics)
-        if best.name == "thermal_drift" and "tau" in best.shapes:
+        if best.name == "thermal_drift" and not best.shapes.get("own"):
             # by the noise that is left: what drifts adds to it
             known = [dataclasses.replace(s, noise=c.noise) for s, c in zip(spectra, cleaned, strict=True)]
             if better := in_its_times(best, recordings, known):
                 best, found = better, [better, *(e for e in record_effects(recordings, known) if e.name not in held | {best.name})]
                 without = remove_record_effect(recordings, best, bench.output)
                 cleaned = spectra_of(without, bench, choices.harmonics)
-        adopted.append((best, [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z)]))
+        # one that warms through another node has more shapes than to be a rival of another
+        adopted.append((best, [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z) and "taus" not in e.shapes]))
         recordings, spectra = without, cleaned
     return adopted, recordings
 

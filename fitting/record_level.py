@@ -18,7 +18,9 @@ CLEAR, LEAST_SHOWN = 25.0, 0.1  # chi2 that a signal of a size would take betwee
 STANDS_OUT = 2.5  # times the largest of the six harmonics beside it, that a hum on a harmonic of the drive is
 MOST_SHOW = 0.5  # of the recordings where a signal would be clear, more of which must show it, or deny it
 HEAT_TIMES = (0.3, 3.0, 30.0)  # s, by which a rod may warm
+THROUGH_TIMES = (0.1, 0.3, 1.0, 3.0)  # the same of what warms through another node, with a tenth of the time of its own
 NODE_TIMES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # the same of two nodes
+REVERSES = 0.02  # of the largest rate of a warming, up to which it may seem to turn back
 LONE_GAIN = 60.0  # fall of chi2 from which a drift of one record may be its alone
 SETTLING = (0.04, 0.15)  # of the record's length: times with which such a record may settle
 AS_ALIKE = 1.02  # spread of drifts per heat in units of that of the drifts, up to which they may as well be heat
@@ -42,14 +44,27 @@ def record_columns(recordings, spectra):
     rows = []
     times = [s.dt * np.arange(s.samples) for s in spectra]
     rows.append(("zero_drift", {}, [t for t in times]))
-    for tau in HEAT_TIMES:
-        rows.append(("thermal_drift", {"tau": tau}, heat_columns(recordings, spectra, {"tau": tau})))
+    longest = max(t[-1] for t in times)
+    shapes = [{"tau": tau} for tau in HEAT_TIMES]
+    shapes += [dict(zip(("taus", "shares"), _scaled((tau, 10 * tau), (-1.0, 1.0), longest)[1:], strict=True)) for tau in THROUGH_TIMES]
+    rows += [("thermal_drift", shape, heat_columns(recordings, spectra, shape)) for shape in shapes]
     return rows
 
 
+def _scaled(taus, rates, longest):
+    """Rates of nodes at the start of a record as (largest rate of them together within it, s, `taus`, their shares of that); 0 where
+    it changes its sign: then it is no warming. What warms through another node begins at rest, with shares that are opposite."""
+    t = np.linspace(0.0, longest, 200)
+    slope = sum(rate * np.exp(-t / tau) for tau, rate in zip(taus, rates, strict=True))
+    most = slope[np.argmax(np.abs(slope))]
+    if np.min(slope * np.sign(most)) < -REVERSES * abs(most):
+        return 0.0, taus, rates
+    return float(most), taus, tuple(float(x / most) for x in rates)
+
+
 def heat_columns(recordings, spectra, shapes) -> list:
-    """What the mean heat of each recording adds to it at a unit rate at its start: by one time, `tau`, or several nodes, `taus`, with
-    their `shares` of that rate."""
+    """What the mean heat of each recording adds to it at a unit rate, its largest, at its start: by one time, `tau`, or several nodes,
+    `taus`, with their `shares` of that rate."""
     parts = zip(shapes.get("taus", (shapes.get("tau"),)), shapes.get("shares", (1.0,)), strict=True)
     columns = [0.0 for _ in spectra]
     for tau, share in parts:
@@ -60,26 +75,32 @@ def heat_columns(recordings, spectra, shapes) -> list:
 
 
 def in_its_times(heat, recordings, spectra) -> RecordEffect | None:
-    """A drift by heat with a time that clearly serves better than its own, or with two: winding and rod warm each in its time; None
-    where its own serves as well."""
-    parts = {tau: [_between(s, c) for s, c in zip(spectra, heat_columns(recordings, spectra, {"tau": tau}), strict=True)] for tau in NODE_TIMES}
+    """A drift by heat with a time that clearly serves better than its own, or with two: winding and rod warm each in its time, or one
+    through the other; None where its own serve as well."""
+    longest = max(s.dt * (s.samples - 1) for s in spectra)
 
-    def fitted(*taus):
+    def reduced(shapes):
+        return [_between(s, c) for s, c in zip(spectra, heat_columns(recordings, spectra, shapes), strict=True)]
+
+    def fitted(*parts):
         G, g = 0.0, 0.0
-        for reduced in zip(*(parts[tau] for tau in taus), strict=True):
-            G = G + np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
-            g = g + np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
+        for columns in zip(*parts, strict=True):
+            G = G + np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in columns] for a in columns])
+            g = g + np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in columns])
         rates = np.linalg.lstsq(G, g, rcond=1e-12)[0]
-        return float(rates @ g), rates, taus
+        return float(rates @ g), rates
 
-    best = max(map(fitted, NODE_TIMES), key=lambda row: row[0])
-    pairs = [fitted(a, b) for a in NODE_TIMES for b in NODE_TIMES if a < b]
-    both = max((row for row in pairs if len(set(np.sign(row[1]))) == 1), key=lambda row: row[0], default=best)
+    alone = {tau: reduced({"tau": tau}) for tau in NODE_TIMES}
+    found = [(*fitted(alone[tau]), (tau,)) for tau in NODE_TIMES]
+    best = max(found, key=lambda row: row[0])
+    pairs = [(*fitted(alone[a], alone[b]), (a, b)) for a in NODE_TIMES for b in NODE_TIMES if a < b]
+    pairs = [row for row in pairs if _scaled(row[2], row[1], longest)[0]]
+    both = max(pairs, key=lambda row: row[0], default=best)
     fall, rates, taus = both if both[0] > best[0] + CLEAR else best
-    if fall < fitted(heat.shapes["tau"])[0] + CLEAR:
+    if fall < fitted(reduced(heat.shapes))[0] + CLEAR:
         return None
-    rate, z = float(np.sum(rates)), float(np.sqrt(fall))
-    shapes = {"taus": taus, "shares": tuple(float(x) / rate for x in rates)}
+    rate, taus, shares = _scaled(taus, rates, longest)
+    z, shapes = float(np.sqrt(fall)), {"taus": taus, "shares": shares}
     return RecordEffect(heat.name, z, rate, abs(rate) / z, shapes, tuple(heat_columns(recordings, spectra, shapes)))
 
 

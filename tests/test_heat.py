@@ -136,6 +136,33 @@ def test_heat_drifts_in_the_times_of_winding_and_rod(nodes, taus):
         assert one.channels["displacement"] == pytest.approx(other.channels["displacement"], abs=1e-15)
 
 
+@pytest.mark.parametrize(("fast", "slow", "size"), [(1.0, 10.0, 3e-5), (3.0, 30.0, 2e-4)])
+def test_a_rod_that_warms_through_its_winding_begins_at_rest(fast, slow, size):
+    """It was a zero that drifts in each record by itself, straight and by the root of time, which left up to three times the noise."""
+    rng, rows = np.random.default_rng(3), []
+    for f, amplitude in ((50, 0.5), (8, 0.5), (30, 0.8), (20, 0.5), (15, 0.8), (2, 0.8), (1, 0.6)):
+        t = np.arange(2000) / (500 * f)
+        warm = 1 - (slow * np.exp(-t / slow) - fast * np.exp(-t / fast)) / (slow - fast)
+        y = 1e-5 * np.sin(2 * np.pi * f * t - 0.2) + 3.6e-8 * rng.standard_normal(len(t)) + size * amplitude**2 / 2 * warm
+        rows.append(Recording(t, {"current": amplitude * np.sin(2 * np.pi * f * t), "displacement": y}, name=f"{f} Hz"))
+    adopted, cleaned = record_level(rows, spectra_of(rows, BENCH), BENCH, Choices())
+    (heat, rivals), *others = adopted
+    assert heat.name == "thermal_drift" and not others and {r.name for r in rivals} <= {"zero_drift"}
+    assert heat.shapes["taus"] == (fast, slow) and heat.shapes["shares"][0] == pytest.approx(-heat.shapes["shares"][1], rel=0.1)
+    assert heat.amplitude * heat.shapes["shares"][1] == pytest.approx(size / (slow - fast), rel=0.1)
+    assert all(s.noise_rms == pytest.approx(3.6e-8, rel=0.1) for s in spectra_of(cleaned, BENCH))
+
+
+def test_a_drift_that_warms_through_another_node_is_no_rival_nor_is_what_the_form_of_one_leaves(monkeypatch):
+    """A zero that drifts alike in all records came out as a group with such a heat, or with one that turned back what was too straight."""
+    drift, heat = (RecordEffect(n, z, 1e-7, 1e-8, shapes, (np.zeros(4),)) for n, z, shapes in (("zero_drift", 20.0, {}), ("thermal_drift", 19.0, {"taus": (3.0, 30.0)})))
+    left = iter([[drift, heat], [dataclasses.replace(heat, z=-6.8)]])
+    monkeypatch.setattr(own_signals, "record_effects", lambda *a: next(left))
+    monkeypatch.setattr(own_signals, "remove_record_effect", lambda recordings, *a: recordings)
+    monkeypatch.setattr(own_signals, "spectra_of", lambda *a: ())
+    assert record_level((), (), BENCH, Choices())[0] == [(drift, [])]
+
+
 @pytest.mark.long
 def test_a_drift_that_does_not_pulse_is_not_said_to():
     task, adopted, base = examined(recorded(pulsation=False))
