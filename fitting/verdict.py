@@ -309,7 +309,8 @@ def _fall(evidence) -> str:
     """What the repair does to the misfit, in words."""
     before, after = evidence.raw.chi2_per_sample, evidence.excess
     if not evidence.reached.steps and before < after + 0.2:
-        return f"{'it stands' if len(evidence.adopted) == 1 else 'they stand'} between the harmonics, and chi2/N is {after:.2f} without"
+        one = len({effect.name for effect, _ in evidence.adopted}) == 1
+        return f"{'it stands' if one else 'they stand'} between the harmonics, and chi2/N is {after:.2f} without"
     return f"chi2/N falls from {before:.3g} to {after:.2f}"
 
 

@@ -1234,6 +1234,14 @@ def test_the_range_of_a_sensors_curve_stands_beside_its_size():
     assert size_of(sizes) == "q = 0.02 ± 0.001; centre = 3e−6 m (given); half = 2e−5 m (given)"
 
 
+@pytest.mark.parametrize(("names", "words"), [(("thermal_drift", "thermal_drift"), "it stands"), (("thermal_drift", "mains_hum"), "they stand")])
+def test_what_stands_between_the_harmonics_is_counted_by_its_names(names, words):
+    """A heat that drifts and pulses is one effect."""
+    adopted = [(SimpleNamespace(name=n), []) for n in names]
+    evidence = SimpleNamespace(raw=SimpleNamespace(chi2_per_sample=1.5), excess=1.61, reached=SimpleNamespace(steps=[]), adopted=adopted)
+    assert fitting.verdict._fall(evidence) == f"{words} between the harmonics, and chi2/N is 1.61 without"
+
+
 def test_a_size_at_its_bound_is_shown_as_such():
     """The spread of a path's lags ended at 1, and was shown as "1 ± 0"."""
     rows = [("gain", 0.1, 0.01, False), ("tilt", 1.0, 0.0, True)]
