@@ -166,13 +166,13 @@ def from_bench(bench) -> Actuator:
 
 def _check_bench(bench):
     """What a bench file alone does not tell: whether there is a coil to drive, and which effects its priors speak of."""
-    from .effects import CATALOGUE
+    from .effects import CLASSES, forms_of
 
     if bench.drive != "voltage" and not any(name.startswith("coil.") for name in bench.constants):
         raise ConfigurationError(
             f"bench {bench.source or bench.name}: has no [coil], so nothing to drive; state one (see docs/parameters.md)"
         )
-    known = {f"effects.{e.name}.{p}" for e in CATALOGUE for p in e.parameters()}
+    known = {f"effects.{name}.{p}" for name in CLASSES for form in forms_of(name) for p in form.parameters()}
     for name in bench.priors:
         if name.startswith("effects.") and name not in known:
             raise ConfigurationError(

@@ -47,7 +47,8 @@ def _model(content):
     actuator = eqx.tree_at(lambda a: a.hysteresis, actuator, hysteresis)
     stated = content["parameters"]
     for name in content["effects"]:
-        effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else form_of(name, stated)()
+        keys = [n.rsplit(".", 1)[1] for n in stated if n.startswith(f"effects.{name}.")]
+        effect = LearnedTerm.null(**content[name]) if name == LearnedTerm.name else form_of(name, keys)()
         actuator = actuator.with_effect(effect)
     known = actuator.parameters()
     # shapes have a default, which leaves a law as it was before it had them

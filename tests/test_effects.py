@@ -12,11 +12,13 @@ import pytest
 from scipy.special import jv
 
 import magjax.effects as effects
+from magjax.acquire.response import effect_of
 from magjax.chain import BLOCKS, Timeline, newton
 from magjax.chain.march import magnetize
 from magjax.chain.mechanics import Mechanics
 from magjax.effects import CATALOGUE, AbstractEffect
 from magjax.effects.field_diffusion import ZEROS, DiffusionModes
+from magjax.errors import ConfigurationError
 from magjax.simulate import run_chain, simulate
 from tests.test_simulate import actuator, sine
 
@@ -113,9 +115,12 @@ def test_the_modes_of_a_solid_rod_are_those_of_its_bessel_functions():
 
 
 def test_a_form_of_a_law_is_told_by_its_parameters():
-    stated = {"effects.field_diffusion.kappa": 1.0, "effects.field_diffusion.tau": 1e-4, "effects.second_mode.gain": 0.1}
-    assert effects.form_of("field_diffusion", stated) is DiffusionModes and effects.form_of("field_diffusion", {}) is effects.FieldDiffusion
-    assert effects.form_of("second_mode", stated) is effects.SecondMode
+    assert effects.form_of("field_diffusion", ("kappa", "tau")) is DiffusionModes
+    assert effects.form_of("field_diffusion", ()) is effects.form_of("field_diffusion", ("kappa",)) is effects.FieldDiffusion
+    assert effects.form_of("second_mode", ("tau",)) is effects.SecondMode and effects.forms_of("second_mode") == (effects.SecondMode,)
+    assert type(effect_of("field_diffusion", {"tau": 2e-4})) is DiffusionModes
+    with pytest.raises(ConfigurationError, match="it has kappa, alike or kappa, tau"):
+        effect_of("field_diffusion", {"tau": 2e-4, "alike": 1.0})
     assert all(form.name == kind.name and form.block == kind.block for kind in CATALOGUE for form in kind.forms)
 
 

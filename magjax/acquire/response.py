@@ -128,19 +128,21 @@ class BenchResponse:
 
 def effect_of(name: str, parameters: dict):
     """An effect of the catalogue by name; raises `ConfigurationError` naming what there is."""
-    from ..effects import CLASSES, refuse_unknown
+    from ..effects import form_of, forms_of, refuse_unknown
 
     refuse_unknown([name])
-    known = CLASSES[name].parameters()
+    kind = form_of(name, parameters)
+    known = kind.parameters()
     for key, value in parameters.items():
         if key not in known:
-            raise ConfigurationError(f'effect {name} has no parameter "{key}"; it has {", ".join(known)}')
+            has = " or ".join(", ".join(form.parameters()) for form in forms_of(name))
+            raise ConfigurationError(f'effect {name} has no parameter "{key}"; it has {has}')
         if not known[key].low <= value <= known[key].high or not np.isfinite(value):
             raise ConfigurationError(
                 f"effect {name}: {key} = {value:g}; give {known[key].low:g} to {known[key].high:g} {known[key].unit}"
             )
-    amplitude = CLASSES[name].amplitude
+    amplitude = kind.amplitude
     if amplitude not in parameters:
         typical = known[amplitude].typical or (known[amplitude].scale,) * 2
         parameters = {amplitude: float(np.sqrt(abs(typical[0] * typical[1]))), **parameters}
-    return CLASSES[name](**parameters)
+    return kind(**parameters)

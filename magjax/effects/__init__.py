@@ -74,10 +74,14 @@ def refuse_unknown(names) -> None:
             raise ConfigurationError(f'no effect "{name}"; the catalogue has {", ".join(CLASSES)}')
 
 
-def form_of(name, parameters) -> type[AbstractEffect]:
-    """The form of an effect's law that has the `parameters`, by their names in a model (effects.NAME.PARAMETER); the first where none has."""
-    own = {n.rsplit(".", 1)[1] for n in parameters if n.startswith(f"effects.{name}.")}
-    return next((c for c in (CLASSES[name], *CLASSES[name].forms) if own <= set(c.parameters())), CLASSES[name])
+def forms_of(name) -> tuple[type[AbstractEffect], ...]:
+    """The forms of an effect's law, the usual one first."""
+    return (CLASSES[name], *CLASSES[name].forms)
 
 
-__all__ = ["CATALOGUE", "CLASSES", "AbstractEffect", "Trial", "form_of", "refuse_unknown"]
+def form_of(name, keys) -> type[AbstractEffect]:
+    """The form of an effect's law that has the parameters `keys`; the usual one where none has."""
+    return next((form for form in forms_of(name) if set(keys) <= set(form.parameters())), CLASSES[name])
+
+
+__all__ = ["CATALOGUE", "CLASSES", "AbstractEffect", "Trial", "form_of", "forms_of", "refuse_unknown"]

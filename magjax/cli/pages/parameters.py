@@ -5,7 +5,7 @@ import sys
 
 from magjax import bench
 from magjax.chain import Coil, FieldCoil, Magnetostriction, Mechanics, Piezo, Sensor
-from magjax.effects import CATALOGUE
+from magjax.effects import CLASSES, forms_of
 from magjax.page import deliver, extent, number, table
 from magjax.param import parameters_of
 
@@ -114,9 +114,11 @@ def page() -> str:
         "nothing while its effect is at null. Laws and sources: [effects.md](effects.md).", "",
     ]  # fmt: skip
     body = []
-    for effect in CATALOGUE:
-        for (mark, name, *rest), info in zip(rows(effect, f"{effect.name}."), effect.parameters().values(), strict=True):
-            body.append((mark, name, *rest[:2], "shape" if info.shape else number(info.null), *rest[2:]))
+    for form in (form for name in CLASSES for form in forms_of(name)):
+        told = {row[1] for row in body}  # of another form
+        for (mark, name, *rest), info in zip(rows(form, f"{form.name}."), form.parameters().values(), strict=True):
+            if name not in told:
+                body.append((mark, name, *rest[:2], "shape" if info.shape else number(info.null), *rest[2:]))
     lines += table(("symbol", "effect.parameter", "unit", "meaning", "null", "default", "typical", "bounds"), body)
     lines += ["", "## Other keys of a bench file", "", *table(("key", "meaning"), ((f"`{k}`", v) for k, v in SETTINGS.items()))]
     quantities = ", ".join(bench.QUANTITIES)
