@@ -34,7 +34,7 @@ SHAPE_GRIDS = {
     "rate_dependent_switching": {"rate0": (1e3, 3e4, 1e6), "of_flux": (0.05, 0.9), "of_drive": (0.0, 0.9)},
     "second_mode": {"f2": tuple(150.0 * 1.09**k for k in range(36)), "xi2": (0.02, 0.1)},  # a mode is narrow
     "structural_damping": {"dispersion": (0.0, 1.0), "mean_below": (0.0, 4.0)},
-    "strain_hysteresis": {"width": (0.03, 0.1), "of_m": (0.05, 0.9)},
+    "strain_hysteresis": {"width": (0.03, 0.1), "of_m": (0.05, 0.9), "smooth": (0.5,)},
     "duffing_stiffness": {"rest": (0.0, 0.35)},  # a spring under preload is at rest within the stroke
     "delta_e": {"static": (0.05, 0.9)},
     "creep": {"shortest": (1e-4, 1e-2), "mean_behind": (0.0, 4.0)},

@@ -142,6 +142,13 @@ def test_a_strain_that_lags_along_the_path_of_m():
                 state = min(max(state, now - width), now + width)
                 path.append(state)
         late += np.asarray(path) / 4
+    dahl, before, path = 0.0, m[0], []
+    for now in np.concatenate([m, m]):  # the steps between two samples, in small ones
+        for _ in range(2000):
+            moved = (now - before) / 2000
+            dahl += moved - abs(moved) * dahl / 0.1
+        path, before = [*path, dahl], now
+    assert strained(of_m=1.0, smooth=1.0) - np.asarray(u) == pytest.approx(-0.1 * float(rod.reach) * np.asarray(path[N:]), rel=1e-3, abs=1e-10)
     assert strained(of_m=1.0) - np.asarray(u) == pytest.approx(0.1 * float(rod.reach) * (late - m), abs=1e-15)
     half = (strained(of_m=1.0) + strained()) / 2
     assert strained(of_m=0.5) == pytest.approx(half, abs=1e-15) and np.abs(half - strained()).max() > 1e-7
