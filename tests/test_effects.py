@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import re
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -12,6 +13,8 @@ import pytest
 from scipy.special import jv
 
 import magjax.effects as effects
+from fitting.attribute import _further_starts
+from fitting.screen import shape_grid
 from magjax.acquire.response import effect_of
 from magjax.chain import BLOCKS, Timeline, newton
 from magjax.chain.march import magnetize
@@ -152,6 +155,18 @@ def test_a_strain_that_lags_along_the_path_of_m():
     assert strained(of_m=1.0) - np.asarray(u) == pytest.approx(0.1 * float(rod.reach) * (late - m), abs=1e-15)
     half = (strained(of_m=1.0) + strained()) / 2
     assert strained(of_m=0.5) == pytest.approx(half, abs=1e-15) and np.abs(half - strained()).max() > 1e-7
+
+
+def test_forms_that_are_far_from_null_are_tried_too():
+    """Of a solid rod the shells are scored; where they leave a misfit its modes are fitted, and not these twice. A strain that lags is
+    scored along either path."""
+    (modes,) = effects.FieldDiffusion().elsewhere(actuator(20))
+    assert type(modes) is DiffusionModes and modes.kappa > 0.5 and not modes.elsewhere(actuator(20))
+    trial = SimpleNamespace(name="field_diffusion", result=SimpleNamespace(actuator=actuator(20).with_effect(effects.FieldDiffusion())))
+    base = SimpleNamespace(actuator=actuator(20))
+    assert (DiffusionModes, base) in [(type(effect), of) for effect, of in _further_starts(base, trial)]
+    grid = shape_grid(effects.StrainHysteresis)
+    assert {g["of_m"] > 0.5 for g in grid} == {True, False} and all(0 < g["smooth"] < 1 for g in grid)
 
 
 def test_effects_act_in_the_order_of_the_catalogue_however_they_are_added():

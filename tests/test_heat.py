@@ -13,7 +13,7 @@ from fitting.demo import concealed_actuator, record
 from fitting.diagnose import diagnose
 from fitting.on_lines import HeatScore
 from fitting.own_signals import heat_on_harmonics, record_level
-from fitting.record_level import RecordEffect, remove_from_checks
+from fitting.record_level import RecordEffect, _scaled, remove_from_checks
 from fitting.report.evidence import model_misfit
 from fitting.setup import Choices, spectra_of
 from fitting.task import Task
@@ -151,6 +151,15 @@ def test_a_rod_that_warms_through_its_winding_begins_at_rest(fast, slow, size):
     assert heat.shapes["taus"] == (fast, slow) and heat.shapes["shares"][0] == pytest.approx(-heat.shapes["shares"][1], rel=0.1)
     assert heat.amplitude * heat.shapes["shares"][1] == pytest.approx(size / (slow - fast), rel=0.1)
     assert all(s.noise_rms == pytest.approx(3.6e-8, rel=0.1) for s in spectra_of(cleaned, BENCH))
+
+
+def test_a_rod_that_warms_does_not_cool_meanwhile():
+    """The rates of nodes by their largest together; what turns back is no warming."""
+    assert _scaled((1.0, 10.0), (-2.0, 1.0), 10.0)[0] == 0.0
+    assert _scaled((1.0, 10.0), (3.0, 1.0), 10.0) == (4.0, (1.0, 10.0), (0.75, 0.25))
+    most, _, shares = _scaled((1.0, 10.0), (-1.0, 1.0), 10.0)
+    assert most == pytest.approx(10 ** (-1 / 9) * 0.9, rel=1e-3) and shares[1] == pytest.approx(1 / most)  # at 10/9 ln 10 s
+    assert _scaled((1.0, 10.0), (1.0, -1.0), 10.0)[0] == -most
 
 
 def test_a_drift_that_warms_through_another_node_is_no_rival_nor_is_what_the_form_of_one_leaves(monkeypatch):
