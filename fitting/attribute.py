@@ -172,13 +172,14 @@ def in_detail(task, base, trial, excess) -> Trial:
 
 
 def _gone_on(task, base, trial, excess, starts, above, target: float = np.inf) -> Trial:
-    """The trial, or the best that other `starts` of its effect lead to, where it takes a part of the misfit and leaves a chi2/N
-    `above` this, and they take enough more; those that cannot come near the `target` end early."""
+    """The trial, or the best that other `starts` of its effect lead to, where it leaves a chi2/N `above` this and takes a part of the
+    misfit, or they are of another form of its law, and they take enough more; those that cannot come near the `target` end early."""
     best = trial
     for start, of in starts:
         result = best.result
-        if not (best.explained_share > DETAIL_SHARE and result.chi2_per_sample > above):
-            break
+        another = type(start) is not type(result.actuator.effect(trial.name))
+        if result.chi2_per_sample <= above or not (another or best.explained_share > DETAIL_SHARE):
+            continue
         same = {"choices": result.choices, "spectra": base.spectra, "target": target}
         finer = task.fit_on(of, of.actuator.with_effect(start), **same)
         if not finer.converged and chi2_of(finer) < target:

@@ -1197,6 +1197,24 @@ def test_a_law_whose_first_order_misleads_is_fitted_from_elsewhere_too(ends, fit
     assert begun == [(False, -0.2), (True, 0.6)][:fits] and found.result.chi2_per_sample == 1.0
 
 
+@pytest.mark.parametrize(("name", "forms"), [("field_diffusion", ["DiffusionModes"]), ("duffing_stiffness", [])])
+def test_another_form_of_a_law_is_fitted_where_the_usual_one_comes_to_nothing(name, forms):
+    """Shells of a rod that behaves as a ladder of one permeability ended far above the plain fit, and its modes were never tried."""
+    rod = load_bench("aa-050h").actuator()
+    base = SimpleNamespace(chi2_per_sample=119.0, data_count=COUNT, actuator=rod, spectra=(), choices=Choices())
+    result = SimpleNamespace(chi2_per_sample=3e6, data_count=COUNT, converged=True, actuator=rod.with_effect(CLASSES[name]()), choices=Choices(), spectra=())
+    begun = []
+
+    class Told(Task):
+        def fit_on(self, start, actuator=None, **more):
+            begun.append(type(actuator.effect(name)).__name__)
+            return SimpleNamespace(chi2_per_sample=1.0, data_count=COUNT, converged=True, actuator=actuator, choices=Choices(), spectra=())
+
+    first = Trial(candidate(name, 210.0), result, -3e6 * COUNT, 3e6 * COUNT, True, -1e4, 2)
+    found = fitting.attribute.settled(Told((), None), base, first, 118.0 * COUNT)
+    assert begun == forms and found.result.chi2_per_sample == (1.0 if forms else 3e6)
+
+
 def test_zeros_of_the_recordings_are_dropped_where_an_effect_meets_the_means_too():
     """A fit in a valley may have asked for them before the effect was found."""
     from fitting.own_signals import needless_zeros
