@@ -83,10 +83,7 @@ def in_its_times(heat, recordings, spectra) -> RecordEffect | None:
         return [_between(s, c) for s, c in zip(spectra, heat_columns(recordings, spectra, shapes), strict=True)]
 
     def fitted(*parts):
-        G, g = 0.0, 0.0
-        for columns in zip(*parts, strict=True):
-            G = G + np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in columns] for a in columns])
-            g = g + np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in columns])
+        G, g = (sum(each) for each in zip(*map(_normal, zip(*parts, strict=True)), strict=True))
         rates = np.linalg.lstsq(G, g, rcond=1e-12)[0]
         return float(rates @ g), rates
 
@@ -142,8 +139,7 @@ def multiples(mains, orders=()) -> list[float]:
 
 def _with_more_tones(spectra, hum) -> RecordEffect:
     """The same with the higher multiples of the mains that show clearly beside those by which it was told."""
-    f, orders, best = hum.shapes["f"], [], None
-    reached = _hum(spectra, multiples(f))[0]
+    f, orders, best, reached = hum.shapes["f"], [], None, hum.z
     for order in MORE_TONES:
         z, tones, fits = _hum(spectra, multiples(f, (*orders, order)))
         if z**2 > reached**2 + CLEAR:
@@ -274,11 +270,16 @@ def drift_of(s, settling=()):
     return gain, sum(x * p for x, p in zip(best, parts, strict=True))
 
 
+def _normal(reduced):
+    """Matrix and right side of the normal equations of columns of one record, as `_between` gives them."""
+    G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
+    return G, np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
+
+
 def _combination(reduced, sizes=None):
     """Amplitudes of columns of one record, as `_between` gives them, by least squares, and the fall of chi2; `sizes`: the
     standard deviation of each that is known beforehand."""
-    G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
-    g = np.array([np.sum(a[0] * (np.conj(a[2]) * a[1]).real) for a in reduced])
+    G, g = _normal(reduced)
     known = 0.0 if sizes is None else np.diag(1 / np.square(sizes))
     best = np.linalg.solve(G + 1e-9 * np.trace(G) * np.eye(len(G)) + known, g)
     return best, float(best @ g)

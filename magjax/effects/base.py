@@ -44,7 +44,7 @@ class AbstractEffect(eqx.Module):
     data), `in_step` (solved inside the step of (4)), `slow` (its state takes longer than
     a few periods: `settled` leads it to where it repeats), `record_level` (acts on the whole record, not period by period),
     `amplitude` (the parameter whose null removes the effect), `shells` (into so many the rod is cut, see chain.shells; 0: not),
-    `forms` (classes of the same name with another form of the law, which a fit may reach by `elsewhere`),
+    `forms` (classes of the same name with another form of the law, which a fit may reach by `elsewhere`; each says its `form`),
     `magnetic` (it means nothing in a stack under voltage, as all of the coil and of the magnetostriction do).
     """
 
@@ -59,6 +59,7 @@ class AbstractEffect(eqx.Module):
     record_level: ClassVar[bool] = False
     shells: ClassVar[int] = 0
     forms: ClassVar[tuple] = ()
+    form: ClassVar[str] = ""
     magnetic: ClassVar[bool] = False
 
     def with_amplitude(self, value):

@@ -81,6 +81,7 @@ class DiffusionModes(AbstractEffect):
     tau: Float[Array, ""] = param(1e-4, "s", "time of the slowest mode", low=0.0, scale=1e-4, shape=True, typical=(1e-6, 1e-3))
 
     name = FieldDiffusion.name
+    form = "by modes"
     block = FieldDiffusion.block
     law = FieldDiffusion.law
     source = FieldDiffusion.source

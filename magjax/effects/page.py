@@ -31,7 +31,7 @@ def page() -> str:
         ]
         lines += ["| parameter | unit | null | typical | meaning |", "|---|---|---|---|---|"]
         rows = [(n, info, "") for n, info in effect.parameters().items()]
-        rows += [(n, info, " (by modes)") for form in effect.forms for n, info in form.parameters().items() if n not in effect.parameters()]
+        rows += [(n, info, f" ({form.form})") for form in effect.forms for n, info in form.parameters().items() if n not in effect.parameters()]
         for name, info, where in rows:
             null = "shape" if info.shape else f"{info.null:g}" if info.null is not None else ""
             typical = f"{info.typical[0]:g} .. {info.typical[1]:g}" if info.typical else ""
