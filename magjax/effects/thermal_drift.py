@@ -23,7 +23,7 @@ class ThermalDrift(AbstractEffect):
     name = "thermal_drift"
     block = "mechanics"
     law = "y -> y + rate theta, d theta/dt = I^2 - theta/tau, theta(0) = 0"
-    source = "one-node thermal model of a coil on a rod"
+    source = "one-node thermal model of a coil on a rod; what drifts within the records is fitted with the times of two nodes where those serve better"
     signature = "a drift that grows with the squared current; a ripple at twice the frequency that falls as 1/f; a zero of each recording, by how warm it began"
     amplitude = "rate"
     magnetic = True
