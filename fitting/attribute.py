@@ -25,7 +25,7 @@ MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
 BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
 FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
-WEAK_TIE = (0.08, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much or that form of the others
+WEAK_TIE = (0.2, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much or that form of the others
 UNCONFIRMED_TIE = (0.3, 50.0)  # the same where check recordings are missed as far with the best as without
 SAME_DIRECTION = 0.97
 OUT_OF_REACH = 10.0  # times the largest typical amplitude: beyond it one law imitates another
@@ -173,14 +173,15 @@ def in_detail(task, base, trial, excess) -> Trial:
 
 def _gone_on(task, base, trial, excess, starts, above, target: float = np.inf) -> Trial:
     """The trial, or the best that other `starts` of its effect lead to, where it leaves a chi2/N `above` this and takes a part of the
-    misfit, or they are of another form of its law, and they take enough more; those that cannot come near the `target` end early."""
+    misfit, or they are of another form of its law, and they take enough more; those that cannot come near the `target` end early, but
+    for another form: it begins so far off that its first steps promise nothing of where it ends."""
     best = trial
     for start, of in starts:
         result = best.result
         another = type(start) is not type(result.actuator.effect(trial.name))
         if result.chi2_per_sample <= above or not (another or best.explained_share > DETAIL_SHARE):
             continue
-        same = {"choices": result.choices, "spectra": base.spectra, "target": target}
+        same = {"choices": result.choices, "spectra": base.spectra, "target": np.inf if another else target}
         finer = task.fit_on(of, of.actuator.with_effect(start), **same)
         if not finer.converged and chi2_of(finer) < target:
             finer = task.fit_on(finer, finer.actuator, **same)

@@ -24,16 +24,19 @@ from .record_level import (
     pulsation_of,
     record_effects,
     remove_record_effect,
+    score_of,
     without_lone_drifts,
     zeros_of,
 )
 from .rows import DRIFTS
 from .screen import screened
 from .setup import spectra_of
+from .spectra import unlikeliness
 from .verdict import HALF, Z_THRESHOLD
 
 HUM_Z = 7.0  # what is no hum scored 5.3 at most, of 180 sets of recordings
 DRIFT_Z = 6.0, 8.0  # no drift: 3.4; beside a drift that was taken out, what its form left scored 6.8
+LASTING_Z = 5.0  # by the noise that is left, flicker that goes on below the records' length: 3.5 at most where nothing drifts, 5.6 at least where it does
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
 NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
@@ -61,9 +64,11 @@ def record_level(recordings, spectra, bench, choices):
     for _ in range(0 if bench.quasistatic or bench.output != "displacement" else 2):
         held = {a.name for a, _ in adopted} | ({"thermal_drift"} if bench.drive == "voltage" else set())  # the heat of a coil
         found = [e for e in record_effects(recordings, spectra) if e.name not in held]
-        best = found[0]
-        if abs(best.z) < (HUM_Z if best.name == "mains_hum" else DRIFT_Z[bool(adopted)]):
+        found = [e for e in found if e.name == "mains_hum" or _lasts(e, recordings, spectra, bench, choices)]
+        best = next(iter(found), None)
+        if best is None or abs(best.z) < (HUM_Z if best.name == "mains_hum" else DRIFT_Z[bool(adopted)]):
             break
+        best = _leaves_least(best, found, recordings, bench, choices)
         without = remove_record_effect(recordings, best, bench.output)
         cleaned = spectra_of(without, bench, choices.harmonics)
         if best.name == "thermal_drift" and not best.shapes.get("own"):
@@ -74,9 +79,28 @@ def record_level(recordings, spectra, bench, choices):
                 without = remove_record_effect(recordings, best, bench.output)
                 cleaned = spectra_of(without, bench, choices.harmonics)
         # one that warms through another node has more shapes than to be a rival of another
-        adopted.append((best, [e for e in found[1:] if abs(e.z) > 0.9 * abs(best.z) and "taus" not in e.shapes]))
+        adopted.append((best, [e for e in found if e.name != best.name and abs(e.z) > 0.9 * abs(best.z) and "taus" not in e.shapes]))
         recordings, spectra = without, cleaned
     return adopted, recordings
+
+
+def _leaves_least(best, found, recordings, bench, choices):
+    """The best, or of drifts the other one where that leaves likelier noise: one that scores by a few records may make others worse."""
+
+    def left(drift):
+        spectra = spectra_of(remove_record_effect(recordings, drift, bench.output), bench, choices.harmonics)
+        return 2 * unlikeliness(spectra, [s.noise for s in spectra])
+
+    others = [e for e in found if best.name in DRIFTS and e.name in set(DRIFTS) - {best.name} and abs(e.z) > DRIFT_Z[0]]
+    return next((e for e in others if left(e) < left(best) - BIC_DROP), best)
+
+
+def _lasts(drift, recordings, spectra, bench, choices) -> bool:
+    """Whether a drift scores by the noise that is left without it, too, of which flicker below the records' length looks like one."""
+    if abs(drift.z) < DRIFT_Z[0]:
+        return True  # too little anyway
+    cleaned = spectra_of(remove_record_effect(recordings, drift, bench.output), bench, choices.harmonics)
+    return score_of(drift, [dataclasses.replace(s, noise=c.noise) for s, c in zip(spectra, cleaned, strict=True)]) > LASTING_Z
 
 
 def hum_on_harmonics(task, adopted, base, candidates=()):

@@ -4,6 +4,7 @@ Each is told from the reading in the time domain, by the noise's spectrum; what 
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -24,6 +25,7 @@ REVERSES = 0.02  # of the largest rate of a warming, up to which it may seem to 
 LONE_GAIN = 60.0  # fall of chi2 from which a drift of one record may be its alone
 SETTLING = (0.04, 0.15)  # of the record's length: times with which such a record may settle
 AS_ALIKE = 1.02  # spread of drifts per heat in units of that of the drifts, up to which they may as well be heat
+BELOW = 16  # lengths of a record down to which flicker goes on
 OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record alone, and the share of the longer ones that must show it
 
 
@@ -364,6 +366,35 @@ def _between(s, column):
     weight = 2.0 / (s.samples * s.noise.density(np.maximum(f, f[1])))
     weight[0] = 0.0
     return weight, np.fft.rfft(s.residue), np.fft.rfft(left)
+
+
+@functools.lru_cache(maxsize=256)
+def _steadiness(samples: int, dt: float, frequency: float, harmonics: int, noise) -> float:
+    phases = np.arange(samples) * dt * frequency
+    column = fit_lines(dt * np.arange(samples), phases, harmonics)[1]
+    c, f = np.fft.rfft(column), np.fft.rfftfreq(samples, dt)
+    told = c / noise.density(np.maximum(f, f[1]))
+    told[0] = 0.0
+    taken = fit_lines(np.fft.irfft(told, samples), phases, harmonics)[1]  # what the score takes of the reading
+    number = BELOW * samples
+    spread = np.abs(np.fft.rfft(taken, number)[1:]) ** 2 * noise.density(np.fft.rfftfreq(number, dt)[1:])
+    return float(min(1.0, samples * np.mean(column * taken) * number / (2 * spread.sum())))
+
+
+def steadiness(s) -> float:
+    """The share of what its bins say of a drift that a record tells: flicker goes on below the first of them, where it looks like one."""
+    return _steadiness(s.samples, s.dt, s.frequency, len(s.reading) - 1, s.noise)
+
+
+def score_of(drift, spectra) -> float:
+    """The score of a drift by other noise than that by which it was found, and by what its records tell of one."""
+    top, bottom = 0.0, 0.0
+    for s, column in zip(spectra, drift.columns, strict=True):
+        weight, r, c = _between(s, column)
+        weight = weight * steadiness(s)
+        top += float(np.sum(weight * (np.conj(c) * r).real))
+        bottom += float(np.sum(weight * np.abs(c) ** 2))
+    return abs(top) / np.sqrt(bottom)
 
 
 def remove_record_effect(recordings, effect, output):

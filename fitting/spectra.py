@@ -219,11 +219,11 @@ def pooled_noise(spectra):
     def moved(s):
         return dataclasses.replace(moving, flicker=moving.flicker / s.dt**moving.slope)
 
-    likelier = _unlikeliness(spectra, map(moved, spectra)) < _unlikeliness(spectra, [common] * len(spectra)) - LIKELIER
+    likelier = unlikeliness(spectra, map(moved, spectra)) < unlikeliness(spectra, [common] * len(spectra)) - LIKELIER
     return moved if likelier else lambda s: common
 
 
-def _unlikeliness(spectra, noises) -> float:
+def unlikeliness(spectra, noises) -> float:
     """Minus the logarithm of Whittle's likelihood of what lies between the harmonics, a noise for each recording."""
     densities = [noise.density(s.between_f) for s, noise in zip(spectra, noises, strict=True)]
     return sum(float(np.sum(np.log(d) + s.between_power / d)) for s, d in zip(spectra, densities, strict=True))
@@ -239,7 +239,7 @@ def with_noise(spectra) -> tuple:
     noises = list(map(pooled_noise(spectra), spectra))
     if all(len(s.between_f) >= 40 for s in spectra):
         own = [estimate_noise([s]) for s in spectra]
-        gain = _unlikeliness(spectra, noises) - _unlikeliness(spectra, own)
+        gain = unlikeliness(spectra, noises) - unlikeliness(spectra, own)
         levels = [float(np.mean(s.between_power)) for s in spectra]
         least = 6 if any(s.drift for s in spectra) else 40
         if gain > least * len(spectra) or (gain > 12 * len(spectra) and max(levels) > 2 * min(levels)):

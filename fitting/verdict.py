@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.words import sized
 
-from .attribute import LIKE_DENSITY, MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
+from .attribute import LIKE_DENSITY, MIN_DROP, MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
 from .check import check_errors, foretold_text
 from .diagnosis import Diagnosis, Evidence, least_excess, misfit
 from .experiments import INSTRUMENTS, instrument_request
@@ -64,14 +64,25 @@ FAR_FROM_NOISE = 10.0  # chi2/N that no repair may leave and still be called one
 def too_little(reached, plain) -> str | None:
     """The names of effects that all but meet the noise and take less than half of what the plain fit leaves above it.
 
-    What a rough density leaves looks like a weak effect, but no effect takes it up.
+    What a rough density leaves looks like a weak effect, but no effect takes it up. One that scores is named beside it where check
+    recordings bear it out.
     """
     if not reached.steps or not reached.current.chi2_per_sample < least_excess(plain):
         return None
     taken = plain.chi2_per_sample - reached.current.chi2_per_sample
-    if taken > HALF * (plain.chi2_per_sample - NULL_CHI2):
+    if taken > HALF * (plain.chi2_per_sample - NULL_CHI2) or _borne_out(reached, plain):
         return None
     return " and ".join(best.name for best, *_ in reached.steps)
+
+
+def _borne_out(reached, plain) -> bool:
+    """Whether check recordings say as much for the one effect found, which scores and is none that a density passes for, as an effect
+    must take."""
+    (best, *_), *more = reached.steps
+    if more or not reached.foretell or best.name in LIKE_DENSITY or abs(best.candidate.z) < Z_THRESHOLD:
+        return False
+    says = reached.foretell.says_for(reached.current, plain)
+    return says is not None and says > MIN_DROP
 
 
 def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:

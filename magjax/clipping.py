@@ -22,6 +22,7 @@ ARCH = 4.0  # hidden height in tolerances; one where the crest is a parabola, tw
 FLAT_TOO = 3.0  # the same of a crest that is taken for as flat as another
 LARGEST = 0.021  # tolerance in spans: above it noise hides what a crest is like
 CORNER = 0.5  # slope beside the plateau over that farther off; 0.75 where a sine is cut, 0.4 for t^4, less where it saturates
+STEP = 3.0  # the same from which a flank falls off to a hold beside the plateau: a step, for slopes grow away from a crest
 SEEN = 1e-4  # of the span: less noise hides no crest
 NOISY = 1.5  # counts of noise, rms: from here on values seldom come back
 TIED, TIED_MORE = 8, 4.0  # samples that equal the extreme, and how many times as often as a level near it
@@ -188,7 +189,7 @@ def _is_cut(x, first, length, tolerance, scatter, corner, arch=ARCH, leaning: bo
         if middle < 3 * near:
             return False  # too few samples to tell a jump from a flank
         slope, beyond = (depth[near] - depth[0]) / near, (depth[3 * near] - depth[near]) / (2 * near)
-        if not slope > max(corner * beyond, 0.0) or _straight(depth[1:reach], scatter):
+        if not slope > max(corner * beyond, 0.0) or slope > STEP * beyond or _straight(depth[1:reach], scatter):
             return False
         slopes.append(slope)
     return length * slopes[0] * slopes[1] / (2 * sum(slopes)) > arch * tolerance

@@ -1,6 +1,8 @@
 """What adds to a record besides the loop: drift at a common rate, of each record by itself, hum; and check recordings without it."""
 
+import dataclasses
 import importlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +10,17 @@ import pytest
 from fitting.diagnosis import Diagnosis
 from fitting.floors import data_problem
 from fitting.own_signals import drifts_of_one, record_level
-from fitting.record_level import lone_drifts, record_effects, remove_from_checks, remove_record_effect
+from fitting.record_level import (
+    RecordEffect,
+    lone_drifts,
+    record_effects,
+    remove_from_checks,
+    remove_record_effect,
+    score_of,
+    steadiness,
+)
 from fitting.setup import Choices, spectra_of
+from fitting.spectra import Noise, fit_lines
 from magjax.bench import load_bench
 from magjax.recording import Recording
 
@@ -53,6 +64,37 @@ def test_a_weak_drift_is_taken_out_where_nothing_else_scores_so_high(rate, found
     assert 6 < z < 8 if found else z < 5.5
     adopted, _ = record_level(runs, spectra_of(runs, BENCH), BENCH, Choices())
     assert [{e.name, *(r.name for r in rivals)} for e, rivals in adopted] == ([{"thermal_drift", "zero_drift"}] if found else [])
+
+
+def flicker(rng, samples, times=16):
+    """Noise of one over f that goes on below the length of a record, as a sensor's does."""
+    f = np.fft.rfftfreq(times * samples)
+    waves = rng.standard_normal(len(f)) + 1j * rng.standard_normal(len(f))
+    slow = np.fft.irfft(waves / np.sqrt(np.maximum(f, f[1])), times * samples)
+    return 3 * NOISE * (slow / np.std(slow))[:samples]
+
+
+@pytest.mark.parametrize("seed", [13, 237])
+def test_flicker_below_the_length_of_the_records_is_no_drift(seed):
+    """It scores 6 and more in one set of sixty, and came out as thermal_drift beside two effects."""
+    rng = np.random.default_rng(seed)
+    runs = records(lambda t: flicker(rng, len(t)), (10.0, 50.0, 120.0))
+    assert max(abs(e.z) for e in scored(runs) if e.name != "mains_hum") > 6
+    assert record_level(runs, spectra_of(runs, BENCH), BENCH, Choices())[0] == []
+
+
+def test_a_record_tells_of_a_drift_what_flicker_leaves():
+    """The score of a straight line has a standard deviation of one in noise of any colour that goes on below."""
+    rng, scores, t = np.random.default_rng(5), [], np.arange(1000.0)
+    noise = Noise(1e-4 * NOISE**2, (3 * NOISE) ** 2 / (2 * np.sum(1 / np.arange(1, 8001))))
+    line = RecordEffect("zero_drift", 0.0, 1.0, 1.0, {}, (t,))
+    for _ in range(200):
+        residue = fit_lines(flicker(rng, 1000), 0.004 * t, 10)[1]
+        s = SimpleNamespace(samples=1000, dt=1.0, frequency=0.004, reading=np.zeros(11), noise=noise, residue=residue)
+        scores.append(score_of(line, [s]))
+    assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.2 and steadiness(s) < 0.3
+    white = dataclasses.replace(noise, flicker=0.0, white=1.0)
+    assert steadiness(SimpleNamespace(**{**vars(s), "noise": white})) == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize("shape", [lambda u: u, np.sqrt], ids=["straight", "root"])

@@ -115,6 +115,11 @@ def test_the_modes_of_a_solid_rod_are_those_of_its_bessel_functions():
     opposing = np.fft.rfft(np.asarray(act.coil.applied_field(half.current) - half.field))[n]
     part = opposing / (float(act.coil.loss) * 2j * np.pi * 80.0 * n * np.fft.rfft(np.asarray(half.flux_density))[n])
     assert np.abs(part - (1 + late) / 2)[::2].max() < 0.01
+    ladder = run_chain(act.replace({"effects.field_diffusion.nearer": 0.8}), CURRENT, DT, 6, 8)
+    opposing = np.fft.rfft(np.asarray(act.coil.applied_field(ladder.current) - ladder.field))[n]
+    late = opposing / (float(act.coil.loss) * 2j * np.pi * 80.0 * n * np.fft.rfft(np.asarray(ladder.flux_density))[n])
+    modes = 8 / ZEROS**2 / (1 + s[:, None] * 6e-4 * (ZEROS[0] / ZEROS) ** 1.2)
+    assert np.abs(late - (1 - np.sum(8 / ZEROS**2) + modes.sum(axis=1)))[::2].max() < 0.01
 
 
 def test_a_form_of_a_law_is_told_by_its_parameters():

@@ -169,7 +169,31 @@ def test_a_drift_that_warms_through_another_node_is_no_rival_nor_is_what_the_for
     monkeypatch.setattr(own_signals, "record_effects", lambda *a: next(left))
     monkeypatch.setattr(own_signals, "remove_record_effect", lambda recordings, *a: recordings)
     monkeypatch.setattr(own_signals, "spectra_of", lambda *a: ())
+    monkeypatch.setattr(own_signals, "score_of", lambda *a: 20.0)
     assert record_level((), (), BENCH, Choices())[0] == [(drift, [])]
+
+
+@dataclasses.dataclass(frozen=True)
+class Left:
+    """A spectrum of what is left without an effect."""
+
+    of: str
+    noise: object = None
+
+
+@pytest.mark.parametrize(("behind", "named"), [(33.0, "zero_drift"), (4.0, "thermal_drift")])
+def test_a_drift_that_leaves_likelier_noise_is_named_before_one_that_scores_higher(monkeypatch, behind, named):
+    """Zeros that settle at rates of their own came out as thermal_drift alone: it scores by some records, and makes others worse."""
+    heat, zero = (RecordEffect(n, z, 1e-7, 1e-8, shapes, (np.zeros(4),)) for n, z, shapes in (("thermal_drift", 13.7, {"tau": 0.3}), ("zero_drift", 12.9, {})))
+    left = iter([[heat, zero], []])
+    monkeypatch.setattr(own_signals, "record_effects", lambda *a: next(left))
+    monkeypatch.setattr(own_signals, "remove_record_effect", lambda recordings, effect, *a: (effect.name,))
+    monkeypatch.setattr(own_signals, "spectra_of", lambda recordings, *a: [Left(recordings[0])])
+    monkeypatch.setattr(own_signals, "unlikeliness", lambda spectra, noises: -behind / 2 if spectra[0].of == "zero_drift" else 0.0)
+    monkeypatch.setattr(own_signals, "score_of", lambda *a: 20.0)
+    monkeypatch.setattr(own_signals, "in_its_times", lambda *a: None)
+    (found, rivals), *_ = record_level(("as recorded",), [Left("")], BENCH, Choices())[0]
+    assert found.name == named and {r.name for r in rivals} == {"zero_drift", "thermal_drift"} - {named}
 
 
 @pytest.mark.long

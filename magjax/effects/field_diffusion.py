@@ -42,7 +42,7 @@ class FieldDiffusion(AbstractEffect):
     law = (
         "k dB/dt -> k [(1 - kappa) mean_j dB_j/dt + kappa mean_j D_ij dB_j/dt] in shell i, D_ij = mean of -2 ln max(u, u'), u = (r/R)^2; "
         "strain by mean m^2, in detail less alike var m; or by the modes of a rod of one permeability, k dB/dt -> k [(1 - kappa) dB/dt + "
-        "kappa sum_n (8/j_n^2) lag_n(dB/dt)], lag of (j_1/j_n)^2 tau, J1(j_n) = 0"
+        "kappa sum_n (8/j_n^2) lag_n(dB/dt)], lag of (j_1/j_n)^2 tau, J1(j_n) = 0, in detail (j_1/j_n)^(2 - nearer) tau"
     )
     source = "Ampere's and Faraday's laws in a conducting cylinder: J. Lammeraner, M. Stafl, Eddy Currents, 1966"
     signature = (
@@ -72,13 +72,17 @@ class DiffusionModes(AbstractEffect):
     """The same in a rod of one permeability: its field is that of modes, each with a time of its own, and the loss is late as a whole.
 
     H less mu^-1 mean B = k s mean B sum_n (8/j_n^2) / (1 + s tau_n), from mean B / H = 2 J1(x) / (x J0(x)) of a cylinder: the total
-    is k. The shells let the permeability follow the loop in every depth; lumped models and linear ladders have this form.
+    is k. The shells let the permeability follow the loop in every depth; lumped models and linear ladders have this form. In detail
+    the times are (j_1/j_n)^(2 - nearer) tau: those of a rod that is not the same throughout, or of a ladder.
     """
 
     kappa: Float[Array, ""] = param(
         0.0, "1", "share of the loss that comes late", low=0.0, high=1.0, scale=0.3, null=0.0, typical=(0.05, 1.0)
     )
     tau: Float[Array, ""] = param(1e-4, "s", "time of the slowest mode", low=0.0, scale=1e-4, shape=True, typical=(1e-6, 1e-3))
+    nearer: Float[Array, ""] = param(
+        0.0, "1", "by how much nearer to one another the modes' times are", low=-1.0, high=1.5, scale=0.3, shape=True, detail=True, typical=(-0.5, 0.5)
+    )
 
     name = FieldDiffusion.name
     form = "by modes"
@@ -91,7 +95,7 @@ class DiffusionModes(AbstractEffect):
 
     def _late(self, trial, state):
         """The modes' flux rates after the step."""
-        times = (self.tau * (ZEROS[0] / ZEROS) ** 2).reshape(-1, *(1,) * (state[0].ndim - 1))
+        times = (self.tau * (ZEROS[0] / ZEROS) ** (2 - self.nearer)).reshape(-1, *(1,) * (state[0].ndim - 1))
         return lagged(state[0], state[1], trial.flux_rate, trial.h, times)
 
     def start(self, trial, actuator):

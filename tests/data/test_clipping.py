@@ -122,6 +122,21 @@ def test_a_lower_crest_that_is_cut_less_leaves_the_limit_a_limit():
     assert is_clipped(np.minimum(two, 0.95) + 2e-3 * np.random.default_rng(0).standard_normal(len(t)))
 
 
+@pytest.mark.parametrize(("low", "hold", "rise", "top"), [(0.97, 35, 12, 80), (0.985, 50, 12, 100), (0.95, 50, 16, 100)])
+def test_a_play_holds_below_its_crest_and_on_it(low, hold, rise, top):
+    """Behind a play the reading of a rod that rings at its crest holds, steps up and holds again: a strong backlash was refused as clipped."""
+    k = np.arange(500)
+
+    def step(begin, length):
+        u = np.clip((k - begin) / length, 0, 1)
+        return u * u * (3 - 2 * u)
+
+    falls = np.clip((k - 110 - hold - rise - top) / 90, 0, 1)
+    period = (1 + low) * step(60, 50) + (1 - low) * step(110 + hold, rise) - 1 - 2 * np.sin(np.pi / 2 * falls) ** 1.2
+    reading = np.tile(period, 4) + 7e-4 * np.random.default_rng(0).standard_normal(2000)
+    assert not is_clipped(reading) and is_clipped(np.minimum(reading, 0.5))
+
+
 def test_noise_after_the_cut_does_not_hide_it():
     t = phases(400, 4)
     y = np.minimum(1e-5 * np.sin(2 * np.pi * t), 8e-6) + 1e-9 * np.random.default_rng(0).standard_normal(len(t))
