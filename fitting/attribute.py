@@ -69,8 +69,10 @@ def excess_of(result, at_noise: float = AT_NOISE) -> float:
 LAGS = ("amplifier_lag", "sensor_lag", "transport_delay")
 # friction and play act alike at their size, and a base that has bent to one scores either
 # a strain linear in M has no score where the density makes all of its first order; what is left of it others of the same kind take up
+# of eddy currents that diffuse a second path makes nearly all, and where R_eddy is free either takes its share
 COMPANIONS = {
-    **dict.fromkeys(("second_eddy_path", *LAGS), LAGS),
+    **dict.fromkeys(LAGS, LAGS),
+    **{"second_eddy_path": (*LAGS, "field_diffusion"), "field_diffusion": ("second_eddy_path",)},
     **{"coulomb_friction": ("backlash",), "backlash": ("coulomb_friction",)},
     **dict.fromkeys(("quartic_magnetostriction", "strain_hysteresis", "sensor_nonlinearity"), ("linear_strain",)),
 }

@@ -6,7 +6,7 @@ import functools
 from .attribute import LIKE_DENSITY, MIN_DROP, chi2_of, excess_of
 from .finer import FINER_FROM, FINEST_BELOW, REFINE_BELOW, finer_hats, finest, hats_of_step
 from .screen import screened
-from .verdict import HALF
+from .verdict import HALF, Z_THRESHOLD
 
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
@@ -48,8 +48,10 @@ def screened_finer(task, base, candidates, free):
     """The base and its candidates; where none would take half of what is left, a finer density is given a chance first.
 
     What a density rougher than its hats leaves scores as effects do (up to 20 on nulls), but on the finest hats (up to 4.3): there
-    they are asked for again.
+    they are asked for again. What next to nothing of a misfit scores may be the hats' too: the next ones are, where they take as much.
     """
+    if base.chi2_per_sample < FINER_FROM[0] and (finer := _as_much(task, base, candidates, free)):
+        return finer, screened(finer, task.choices)
     if base.choices.knots is None or _leader_takes(base, candidates) > HALF:
         return base, candidates
     if base.chi2_per_sample > REFINE_BELOW:
@@ -63,6 +65,15 @@ def screened_finer(task, base, candidates, free):
         if finer.chi2_per_sample < REFINE_BELOW and excess_of(finer, 1.0) < FINEST_LEAVE * excess_of(base, 1.0):
             return finer, screened(finer, task.choices)
     return base, candidates
+
+
+def _as_much(task, base, candidates, free):
+    """The fit on the next finer hats, where an effect scores though the noise is all but met and these take what it promises; None elsewhere."""
+    promised, hats = _promised(candidates), finer_hats(base.choices)
+    if promised < Z_THRESHOLD**2 or not hats or task.bench.drive != "current":
+        return None
+    finer = task.fit_on(base, base.actuator, extra=free, choices=hats[0])
+    return finer if chi2_of(finer) < chi2_of(base) - promised else None
 
 
 def _on_finer_hats(task, base, free):
@@ -98,5 +109,9 @@ def _on_last_hats(task, base, free):
 
 def _leader_takes(base, candidates) -> float:
     """Of what a fit leaves, the most that an effect promises which no density passes for."""
-    best = max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)
-    return best / max(excess_of(base, 1.0), MIN_DROP)
+    return _promised(candidates) / max(excess_of(base, 1.0), MIN_DROP)
+
+
+def _promised(candidates) -> float:
+    """The most that it promises, as a fall of chi2."""
+    return max((c.z**2 for c in candidates if c.name not in LIKE_DENSITY), default=0.0)

@@ -20,17 +20,18 @@ from .attribute import (
     leaders,
     rivals_of,
     taken_beside,
+    to_the_end,
     worth_ending,
 )
 from .check import check_errors
 from .diagnosis import SILENT_CHI2
-from .exchange import backward, both_found, commuted, exchange
+from .exchange import MOST_RIVALS, backward, both_found, commuted, exchange
 from .finer import finest
 from .foretold import Foreteller
 from .rows import SLOW
 from .screen import screened
 from .task import Late, periods_from
-from .together import let_go
+from .together import let_go, together
 from .trials import try_all
 from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
 
@@ -136,6 +137,9 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
         state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good, best = _best_of(trials, hidden)
+        if best is None and (left := _in_place_of_unphysical(task, base, state, trials)):
+            candidates = left
+            continue
         if best is None:
             break
         if any(free_means(t.result, best.result) for t in good if t.name in SLOW):
@@ -181,6 +185,30 @@ def _of_another_pair(task, base, state, candidates, check) -> list:
     state.steps, state.current = [], base
     state.adopt(other, good)
     return left
+
+
+def _in_place_of_unphysical(task, base, state, trials) -> list:
+    """The scores beside a rival of the one effect found, in its place, where that turns unphysical beside a further one which takes
+    enough: it stood for the two, and the rival and that one serve better. [] elsewhere."""
+    wrong = [t for t in trials if not t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
+    if len(state.steps) != 1 or not wrong:
+        return []
+    first, _, good, _ = state.steps[0]
+    second = min(wrong, key=lambda t: t.bic_change)
+    least, of_one = chi2_of(state.current) - BIC_DROP, np.log(base.data_count)
+    rivals = sorted((t for t in good if t.name not in (first.name, second.name)), key=lambda t: t.bic_change)[:MOST_RIVALS]
+
+    def beside(t):
+        return lambda say: to_the_end(task.on(progress=say), t.result, second.candidate, excess_of(t.result), least)
+
+    pairs = zip(rivals, together([beside(t) for t in rivals], task.progress), strict=True)
+    serving = [(chi2_of(pair.result) + (t.parameters + pair.parameters - first.parameters) * of_one, t) for t, pair in pairs if pair.physical]
+    ahead, other = min(serving, key=lambda row: row[0], default=(np.inf, None))
+    if not ahead < least:
+        return []
+    state.steps, state.current = [], base
+    state.adopt(other, good)
+    return screened(other.result, task.choices)
 
 
 def _best_of(trials, hidden: bool = False):

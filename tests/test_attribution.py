@@ -380,6 +380,32 @@ def test_what_takes_less_than_half_of_the_rest_is_not_named(base, after, named):
     assert chi2_of(best.result) == after * COUNT
 
 
+@pytest.mark.parametrize(("left", "physical", "gives_way"), [(1.13, True, True), (1.24, True, False), (1.13, False, False)])
+def test_what_turns_unphysical_beside_a_further_effect_gives_way_to_a_rival(monkeypatch, left, physical, gives_way):
+    """An excess loss and a damping of 0.5 % were called coulomb_friction, whose force turned its sign beside the excess loss."""
+    import fitting.search
+
+    friction, damping, loss = trial("coulomb_friction", 1.25, base=1.85, parameters=3), trial("structural_damping", 1.375, base=1.85, parameters=4), trial("excess_loss", 1.384, base=1.85)
+    plain = SimpleNamespace(chi2_per_sample=1.85, data_count=COUNT)
+    state = Reached(plain, [], {})
+    state.adopt(friction, [friction, damping, loss])
+    begun = []
+
+    def to_the_end(task, base, candidate, *more):
+        begun.append((base.chi2_per_sample, candidate.name))
+        return trial("excess_loss", left, base=1.375, parameters=2, physical=physical)
+
+    monkeypatch.setattr(fitting.search, "to_the_end", to_the_end)
+    monkeypatch.setattr(fitting.search, "screened", lambda result, choices: ["scores beside it"])
+    beside = [trial("excess_loss", 1.15, base=1.25, parameters=2, physical=False), trial("creep", 1.24, base=1.25)]
+    found = fitting.search._in_place_of_unphysical(Task((), None), plain, state, beside)
+    assert begun == [(1.375, "excess_loss")] and found == (["scores beside it"] if gives_way else [])
+    assert names([step[0] for step in state.steps]) == (["structural_damping"] if gives_way else ["coulomb_friction"])
+    assert state.current.chi2_per_sample == (1.375 if gives_way else 1.25)
+    assert not fitting.search._in_place_of_unphysical(Task((), None), plain, dataclasses.replace(state, steps=state.steps * 2), beside)
+    assert not fitting.search._in_place_of_unphysical(Task((), None), plain, state, beside[1:])
+
+
 @pytest.mark.parametrize(
     ("name", "z", "says", "named"),
     [("backlash", 7.0, 44.0, True), ("backlash", 7.0, 20.0, False), ("backlash", 4.0, 44.0, False), ("mean_field", 9.0, 44.0, False),

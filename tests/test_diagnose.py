@@ -448,6 +448,9 @@ def test_a_misfit_that_cells_alone_explain_is_the_density(monkeypatch, bench, ch
         ((3.0, 0), 9.0, {}, [], 0),  # one that did not
         ((1.4, 2), 3.0, {}, [], 2),
         ((2.0, 3), 3.0, {}, [], 3),
+        ((0.996, 0), 6.2, {1: 0.4}, [1], 1),  # a friction on a null whose density the first hats followed all but
+        ((0.996, 0), 6.2, {1: 0.7}, [1], 0),
+        ((0.996, 0), 5.0, {}, [], 0),
     ],
 )
 def test_effects_are_asked_for_on_the_finest_hats_where_a_rough_density_hides_them(monkeypatch, bench, plain, score, left, asked, taken):
