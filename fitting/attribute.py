@@ -175,13 +175,14 @@ def in_detail(task, base, trial, excess) -> Trial:
 
 def _gone_on(task, base, trial, excess, starts, above, target: float = np.inf) -> Trial:
     """The trial, or the best that other `starts` of its effect lead to, where it leaves a chi2/N `above` this and takes a part of the
-    misfit, or they are of another form of its law, and they take enough more; those that cannot come near the `target` end early, but
-    for another form: it begins so far off that its first steps promise nothing of where it ends."""
+    misfit, or they are of another form of its law and it leaves more than noise, and they take enough more. Those that cannot come
+    near the `target` end early, but for another form: it begins so far off that its first steps promise nothing of where it ends."""
     best = trial
     for start, of in starts:
         result = best.result
         another = type(start) is not type(result.actuator.effect(trial.name))
-        if result.chi2_per_sample <= above or not (another or best.explained_share > DETAIL_SHARE):
+        least = min(above, SETTLED_CHI2) if another else above
+        if result.chi2_per_sample <= least or not (another or best.explained_share > DETAIL_SHARE):
             continue
         same = {"choices": result.choices, "spectra": base.spectra, "target": np.inf if another else target}
         finer = task.fit_on(of, of.actuator.with_effect(start), **same)

@@ -137,7 +137,7 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
         state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good, best = _best_of(trials, hidden)
-        if best is None and (left := _in_place_of_unphysical(task, base, state, trials)):
+        if left := _in_place_of_unphysical(task, base, state, trials, best):
             candidates = left
             continue
         if best is None:
@@ -187,10 +187,11 @@ def _of_another_pair(task, base, state, candidates, check) -> list:
     return left
 
 
-def _in_place_of_unphysical(task, base, state, trials) -> list:
+def _in_place_of_unphysical(task, base, state, trials, best) -> list:
     """The scores beside a rival of the one effect found, in its place, where that turns unphysical beside a further one which takes
-    enough: it stood for the two, and the rival and that one serve better. [] elsewhere."""
-    wrong = [t for t in trials if not t.physical and t.drop > MIN_DROP and t.bic_change < -BIC_DROP]
+    more than the `best` that does not, if any does: it stood for the two, and the rival and that one serve better. [] elsewhere."""
+    worth = (best.bic_change if best else 0.0) - BIC_DROP
+    wrong = [t for t in trials if not t.physical and t.drop > MIN_DROP and t.bic_change < worth]
     if len(state.steps) != 1 or not wrong:
         return []
     first, _, good, _ = state.steps[0]
