@@ -43,9 +43,10 @@ def promises(base, result, candidates) -> bool:
     return result.chi2_per_sample > FAR_BESIDE and promised > least
 
 
-def of_two(task, best, left, good, with_others=None):
+def of_two(task, best, left, good, with_others=None, means=lambda fit, scores: False):
     """The best and the scores beside it; or a rival's, with which a further effect explains what the best leaves; `with_others`: the
-    fit of the best with what was found beside it, if any was.
+    fit of the best with what was found beside it, if any was; `means(fit, scores)`: whether beside a rival means of the recordings serve
+    as that further one, which ends it: (None, scores).
 
     One effect with shapes of its own imitates two others better than either of them alone; and where none takes most, the
     first to be found is seldom one of the two. Rivals of other directions are looked ahead from by their scores.
@@ -62,6 +63,8 @@ def of_two(task, best, left, good, with_others=None):
             continue
         tried.append(rival)
         scores = screened(rival.result, task.choices)
+        if means(rival.result, scores):
+            return None, scores
         first, excess = scores[0], excess_of(rival.result)
         promised = chi2_of(rival.result) - first.z**2
         if first.z**2 > HALF * excess and promised < chi2_of(best.result) - MIN_DROP:

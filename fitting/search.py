@@ -156,7 +156,9 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
         if best.name not in SLOW and free_means(best.result, best.result, left):
             return task, made_up, True
         if not state.steps and not promises(base, best.result, left):
-            best, left = of_two(task, best, left, good)
+            best, left = of_two(task, best, left, good, means=lambda fit, scores, of=best.result: free_means(fit, of, scores))
+            if best is None:
+                return task, made_up, True
         found, good, task = refitted(task, state.current, best, good, excess, any_rest, not promises(base, best.result, left))
         candidates = left if found.result is best.result else screened(found.result, task.choices)
         state.adopt(found, good)
