@@ -216,10 +216,11 @@ def _in_place_of_unphysical(task, base, state, trials, best) -> list:
 
 def _best_of(trials, hidden: bool = False):
     """The trials that take enough for their parameters and are physical, and the best of them, or None; of `hidden` ones, for
-    which check recordings must speak, any that take more than they do on nulls."""
+    which check recordings must speak, any that take more than they do on nulls, the best of which must be a feedback: others score."""
     least, worth = (HIDDEN_DROP, np.inf) if hidden else (MIN_DROP, -BIC_DROP)
     good = [t for t in trials if t.physical and t.drop > least and t.bic_change < worth]
-    return good, min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5), default=None)
+    best = min(good, key=lambda t: t.bic_change + (0 if t.result.converged else 5), default=None)
+    return good, None if hidden and best and best.name not in FEEDBACKS else best
 
 
 def _calm(state) -> bool:
