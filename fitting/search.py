@@ -137,7 +137,7 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
         state.under_way.update((t.name, t) for t in trials)
         state.tried = {t.name: t.candidate for t in trials} | state.tried  # the first time beside the plain fit
         good, best = _best_of(trials, hidden)
-        if left := _in_place_of_unphysical(task, base, state, trials, best):
+        if not hidden and (left := _in_place_of_unphysical(task, base, state, trials, best)):
             candidates = left
             continue
         if best is None:
@@ -190,8 +190,8 @@ def _of_another_pair(task, base, state, candidates, check) -> list:
 
 
 def _in_place_of_unphysical(task, base, state, trials, best) -> list:
-    """The scores beside a rival of the one effect found, in its place, where that turns unphysical beside a further one which takes
-    more than the `best` that does not, if any does: it stood for the two, and the rival and that one serve better. [] elsewhere."""
+    """The scores beside a rival of the one effect found, in its place, where that and a further one are unphysical together and take
+    more than it and the `best`, if there is any: it stood for two, and the rival and that one serve better. [] elsewhere."""
     worth = (best.bic_change if best else 0.0) - BIC_DROP
     wrong = [t for t in trials if not t.physical and t.drop > MIN_DROP and t.bic_change < worth]
     if len(state.steps) != 1 or not wrong:
