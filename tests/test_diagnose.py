@@ -221,7 +221,7 @@ def alone(monkeypatch, **made):
     """The rounds of a search by themselves, with what is `made` in place of its parts."""
     usual = {
         "leaders": lambda candidates: candidates, "screened": lambda *a: [scored("backlash", 20.0)], "_predicts_worse": lambda *a: False,
-        "refitted": lambda task, now, best, good, *a: (best, good, task), "of_two": lambda task, best, left, good: (best, left),
+        "refitted": lambda task, now, best, good, *a: (best, good, task), "of_two": lambda task, best, left, good, **more: (best, left),
     }  # fmt: skip
     for name, function in {**usual, **made}.items():
         monkeypatch.setattr(search_module, name, function)
