@@ -107,11 +107,7 @@ def record_effects(recordings, spectra) -> list[RecordEffect]:
     """Drift, heat and hum scored on what the harmonics leave, best first."""
     found = {}
     for name, shapes, columns in record_columns(recordings, spectra):
-        top, bottom = 0.0, 0.0
-        for s, column in zip(spectra, columns, strict=True):
-            weight, r, c = _between(s, column)
-            top += float(np.sum(weight * (np.conj(c) * r).real))
-            bottom += float(np.sum(weight * np.abs(c) ** 2))
+        top, bottom = _of_common_size(spectra, columns)
         z, amplitude = top / np.sqrt(bottom), top / bottom
         if name not in found or abs(z) > abs(found[name].z):
             found[name] = RecordEffect(name, float(z), float(amplitude), float(1 / np.sqrt(bottom)), shapes, tuple(columns))
@@ -272,6 +268,17 @@ def drift_of(s, settling=()):
     return gain, sum(x * p for x, p in zip(best, parts, strict=True))
 
 
+def _of_common_size(spectra, columns, share=lambda s: 1.0):
+    """Right side and matrix of the normal equation of columns that have one size in all records; `share`: of what a record tells of it."""
+    top, bottom = 0.0, 0.0
+    for s, column in zip(spectra, columns, strict=True):
+        weight, r, c = _between(s, column)
+        weight = share(s) * weight
+        top += float(np.sum(weight * (np.conj(c) * r).real))
+        bottom += float(np.sum(weight * np.abs(c) ** 2))
+    return top, bottom
+
+
 def _normal(reduced):
     """Matrix and right side of the normal equations of columns of one record, as `_between` gives them."""
     G = np.array([[np.sum(a[0] * (np.conj(a[2]) * b[2]).real) for b in reduced] for a in reduced])
@@ -388,12 +395,7 @@ def steadiness(s) -> float:
 
 def score_of(drift, spectra) -> float:
     """The score of a drift by other noise than that by which it was found, and by what its records tell of one."""
-    top, bottom = 0.0, 0.0
-    for s, column in zip(spectra, drift.columns, strict=True):
-        weight, r, c = _between(s, column)
-        weight = weight * steadiness(s)
-        top += float(np.sum(weight * (np.conj(c) * r).real))
-        bottom += float(np.sum(weight * np.abs(c) ** 2))
+    top, bottom = _of_common_size(spectra, drift.columns, steadiness)
     return abs(top) / np.sqrt(bottom)
 
 
