@@ -68,7 +68,8 @@ def ties_of(evidence) -> dict:
     """For each member of a group what a fit with it reached, and why it is not told from the best: name -> chi2_per_sample, why."""
     ties = {}
     for effect, rivals in evidence.adopted:
-        why = "between the harmonics its score comes near the best's"
+        zeros = effect.shapes.get("zeros")
+        why = "both move a recording's mean level as a whole" if zeros else "between the harmonics its score comes near the best's"
         ties |= {r.name: {"chi2_per_sample": None, "why": why if r is not effect else ""} for r in (effect, *rivals) if rivals}
     steps = evidence.reached.steps
     for k, (best, rivals, *_) in enumerate(steps):

@@ -18,7 +18,9 @@ from fitting.record_level import (
     remove_record_effect,
     score_of,
     steadiness,
+    zeros_of,
 )
+from fitting.rows import ties_of
 from fitting.setup import Choices, spectra_of
 from fitting.spectra import Noise, fit_lines
 from magjax.bench import load_bench
@@ -95,6 +97,15 @@ def test_a_record_tells_of_a_drift_what_flicker_leaves():
     assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.2 and steadiness(s) < 0.3
     white = dataclasses.replace(noise, flicker=0.0, white=1.0)
     assert steadiness(SimpleNamespace(**{**vars(s), "noise": white})) == pytest.approx(1.0, abs=0.02)
+
+
+def test_why_two_drifts_are_not_told_apart_is_where_they_show():
+    """Zeros of the recordings were said to come near one another between the harmonics, where they do not show."""
+    within = RecordEffect("zero_drift", 9.0, 1e-7, 1e-8, {}), RecordEffect("thermal_drift", 8.9, 1e-7, 1e-8, {"tau": 3.0})
+    means = zeros_of([SimpleNamespace(peak_to_peak=4e-5)], 23.0, [1e-6], [1e-7])
+    for (effect, rival), why in ((within, "between the harmonics"), (means, "mean level as a whole")):
+        ties = ties_of(SimpleNamespace(adopted=((effect, [rival]),), reached=SimpleNamespace(steps=[])))
+        assert why in ties["thermal_drift"]["why"] and ties["zero_drift"]["why"] == ""
 
 
 @pytest.mark.parametrize("shape", [lambda u: u, np.sqrt], ids=["straight", "root"])
