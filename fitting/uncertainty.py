@@ -4,6 +4,9 @@ import dataclasses
 
 import numpy as np
 
+from .joint import data_residual, prior_matrix
+from .solver import cost_of
+
 WIDEN = 1.3  # stated errors are widened by this: the evidence weights take the roughness for granted
 WIDEN_BESIDE = 2.6  # the same beside an effect: its law's form is taken for granted too
 GAUGES = {  # free without a prior beside free masses, and why nothing holds them
@@ -15,6 +18,8 @@ GAUGES = {  # free without a prior beside free masses, and why nothing holds the
 GAUGES |= dict.fromkeys(("piezo.stroke", "piezo.P_m", "piezo.V_m"), "the masses and chi, scaled, do the same: give it a prior")
 NO_PRIOR = 1e-2  # in the optimiser's coordinate: what keeps a parameter finite
 UNDERSMOOTH = 0.1  # parameters are quoted with a tenth of the roughness weights
+RISE = 0.35  # of the cost, that a standard error must bring on the fine grid at least (a half is due), else it is led farther:
+FARTHER = 3  # times, each twice as far
 UNBIASED_BELOW = 1.3  # chi2/N below which what the floor of the density does to them is told
 
 
@@ -68,6 +73,29 @@ def floor_shift(problem, solution) -> np.ndarray:
     return shift
 
 
+def widened(problem, solution, cov, index: int) -> float:
+    """By how much the standard error of an unknown must be wider for the cost on the fine grid to rise by a half at its ends.
+
+    Steep loops of soft materials move by less than a sample of the Jacobian's grid, whose slopes then promise more than the fine
+    grid keeps. The others follow as their covariance `cov` says; 1 at least.
+    """
+    layout, z = problem.layout, solution.z
+    if not cov[index, index] > 0:
+        return 1.0
+    prior, along = prior_matrix(problem, solution.weights), cov[:, index] / np.sqrt(cov[index, index])
+
+    def cost(z):
+        z = np.clip(z, *layout.bounds)
+        return cost_of(data_residual(problem, z), z, prior)
+
+    here, rise, times = cost(z), 0.0, 1.0
+    for times in 2.0 ** np.arange(FARTHER + 1):
+        rise = 0.5 * (cost(z + times * along) + cost(z - times * along)) - here
+        if not rise < RISE:
+            break
+    return float(max(times * np.sqrt(0.5 / max(rise, RISE)), 1.0)) if times > 1 else 1.0
+
+
 def estimates(problem, solution, actuator) -> list[Estimate]:
     """Every declared parameter of the fitted actuator with its error.
 
@@ -85,7 +113,8 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
         if name in layout.names:
             index, value = layout.index(name), float(layout.value(name, z + half))
             slope = layout.slope(name, solution.z)
-            stderr = widen * abs(slope) * float(np.hypot(np.sqrt(max(cov[index, index], 0.0)), half[index]))
+            own = widened(problem, solution, cov, index) * np.sqrt(max(cov[index, index], 0.0))
+            stderr = widen * abs(slope) * float(np.hypot(own, half[index]))
             reach = max(abs(value), info.scale)
             at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach or not inside[index])
             start = float(layout.starts[layout.names.index(name)])

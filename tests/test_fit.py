@@ -31,6 +31,7 @@ from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquard
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import agreeing, equation_error_start, operator_rows, unfold
 from fitting.steps import stepped
+from fitting.uncertainty import widened
 from magjax.bench import load_bench
 from magjax.effects import SensorNonlinearity
 from magjax.errors import ConfigurationError, RecordingError
@@ -885,3 +886,18 @@ def test_a_fast_loop_passes_zero_where_slower_ones_do():
 def test_one_period_is_no_steady_state():
     with pytest.raises(ConfigurationError, match="periods = 1: a steady state takes two"):
         build_problem((), None, None, (), Choices(periods=1))
+
+
+@pytest.mark.parametrize(("flat", "factor"), [(0.0, 1.0), (1.5, 4 / 2.5), (100.0, 8 / np.sqrt(0.7))])
+def test_an_error_goes_as_far_as_the_fine_grid_lets_it(monkeypatch, flat, factor):
+    """A misfit that does not move within `flat` standard errors of the Jacobian's; of what nothing holds, eight times the error is said, and more."""
+    layout = SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf)))
+    solution = SimpleNamespace(z=np.zeros(2), weights=())
+    monkeypatch.setattr("fitting.uncertainty.prior_matrix", lambda *_: np.zeros((2, 2)))
+    cov = np.diag([4.0, 9.0])
+    monkeypatch.setattr(
+        "fitting.uncertainty.data_residual", lambda _, z: np.append(np.sign(z[0]) * max(abs(z[0]) / 2 - flat, 0.0), z[1] / 3)
+    )
+    problem = SimpleNamespace(layout=layout)
+    assert widened(problem, solution, cov, 0) == pytest.approx(factor)
+    assert widened(problem, solution, cov, 1) == 1.0

@@ -8,6 +8,7 @@ import pytest
 from fitting.check import check_errors
 from fitting.diagnose import diagnose
 from fitting.fit import fit
+from fitting.scale import profile_intervals
 from magjax.bench import load_bench
 from magjax.effects import CATALOGUE
 from magjax.recording import load_recordings
@@ -19,13 +20,24 @@ def test_rod_from_raw_captures_predicts_the_frequency_left_out(measured):
     found = fit([runs[0], runs[2]], bench, refine=False)
     k = found.estimate("coil.k_eddy")
     # the loss per cycle grows by 0.0514 (10 to 20 Hz) and 0.0551 (20 to 50 Hz) times the integral of (dB/dt)^2
-    assert abs(k.value - 0.053) < 0.004 and 3e-4 < k.stderr < 3e-3
+    assert abs(k.value - 0.053) < 0.004 and 3e-4 < k.stderr < 5e-3
     row = check_errors(found.actuator, found.actuator, [runs[1]], bench)[0]
     assert row["rms_after"] < 1.3 * row["noise_rms"]
     static = dataclasses.replace(bench, free=("hysteresis.masses",), constants={**bench.constants, "coil.k_eddy": 0.0})
     plain = fit([runs[0], runs[2]], static, refine=False)
     before = check_errors(plain.actuator, plain.actuator, [runs[1]], bench)[0]
     assert before["rms_after"] > 1.4 * row["rms_after"]
+
+
+def test_the_stated_error_of_the_rod_is_that_of_a_profile(measured):
+    """Its steep loops move by less than a sample of the Jacobian's grid, whose slopes alone promise 0.001."""
+    bench = load_bench("rod-eddy")
+    runs = load_recordings([str(measured / f"rod_eddy/captures_f0{f}.csv") for f in (10, 20, 50)], bench)
+    found = fit(runs, bench)
+    k = found.estimate("coil.k_eddy")
+    low, high = profile_intervals(found).interval("coil.k_eddy")
+    assert low < 0.0522 < high and low < k.value < high  # 0.0522: another path of the solver ended there
+    assert 0.7 < k.stderr / ((high - low) / (2 * 1.96)) < 1.4
 
 
 @pytest.mark.long
@@ -57,11 +69,11 @@ def test_concealed_eddy_currents_of_the_rod_are_found(measured, frequencies):
     concealed = bench.actuator().replace({"coil.k_eddy": 0.0})
     found = diagnose([every[f] for f in frequencies], bench, check=check, actuator=concealed)
     assert "eddy_currents" in claimed(found), str(found)
-    if check:  # by itself, or at the head of a group with a delay of the pick-up
+    if check:  # by itself, or at the head of a group with a delay or a lag of the pick-up
         sizes = {e["name"]: e["parameters"] for e in found.effects} | found.rivals
-        assert set(sizes) <= {"eddy_currents", "transport_delay"} and next(iter(sizes)) == "eddy_currents", str(found)
+        assert set(sizes) <= {"eddy_currents", "transport_delay", "sensor_lag"} and next(iter(sizes)) == "eddy_currents", str(found)
         k = sizes["eddy_currents"]["k"]
-        assert abs(k["value"] - 0.053) < 0.004 and 3e-4 < k["stderr"] < 3e-3
+        assert abs(k["value"] - 0.053) < 0.004 and 1e-3 < k["stderr"] < 1e-2  # half of a profile's interval is 0.004, widened beside an effect
         assert found.check[0]["rms_after"] < 0.75 * found.check[0]["rms_before"]
 
 
