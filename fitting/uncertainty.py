@@ -90,10 +90,10 @@ def widened(problem, solution, cov, index: int) -> float:
 
     here, rise, times = cost(z), 0.0, 1.0
     for times in 2.0 ** np.arange(FARTHER + 1):
-        rise = 0.5 * (cost(z + times * along) + cost(z - times * along)) - here
-        if not rise < RISE:
+        rise = np.nan_to_num(0.5 * (cost(z + times * along) + cost(z - times * along)) - here, nan=np.inf)
+        if rise >= RISE:
             break
-    return float(max(times * np.sqrt(0.5 / max(rise, RISE)), 1.0)) if times > 1 else 1.0
+    return float(max(times * np.sqrt(0.5 / max(rise, RISE)), times / 2)) if times > 1 else 1.0
 
 
 def estimates(problem, solution, actuator) -> list[Estimate]:
