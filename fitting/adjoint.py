@@ -15,6 +15,7 @@ import numpy as np
 
 from magjax.chain import Timeline
 from magjax.chain.march import Steps, linearized
+from magjax.chain.shells import distribution
 from magjax.effects.base import AbstractEffect
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain
@@ -174,7 +175,7 @@ class Rows:
         each; of a rod in shells their mean."""
         steps, current = self.marched.steps, self.marched.current
         periods = (steps.magnetization.shape[1] - 1) // current.shape[1]
-        return steps.relay_field.mean(axis=2), steps.magnetization, np.concatenate([np.tile(current, periods), current[:, :1]], axis=1)
+        return steps.relay_field @ distribution(steps.relay_field.shape[2])[1], steps.magnetization, np.concatenate([np.tile(current, periods), current[:, :1]], axis=1)
 
     def of_drive(self, change) -> np.ndarray:
         """The same by a change of the current, A, (columns, recordings, samples)."""

@@ -40,6 +40,7 @@ LASTING_Z = 5.0  # by the noise that is left, flicker that goes on below the rec
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
 NEARLY_ALL = 0.9  # of a misfit, that means must hold where the readings drift within the recordings, too
+ALIKE = 0.1  # spread of zeros in units of their mean, below which they are one: a zero of the sensor's, and none that changes
 MEANS_HOLD = 0.5  # of what is left beside a slow effect, that the means of the recordings must hold
 MOST_OF_IT = 0.8  # of a misfit, that hum on harmonics, or a rod's breathing with the heat, must take
 HEAT_PASSES, NOTHING_LEFT = 2, 2.0  # fits that find the rate of a pulsation, and z of what they may leave of it
@@ -186,7 +187,7 @@ def own_zeros(task, adopted, base, candidates):
     excess = excess_of(base)
     z, zeros, errors = zeros_score(base.problem, base.refined)
     likely = [c for c in candidates if abs(c.z) > CLOSE * z]
-    if z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 * (1 - WEAK_TIE[0]) - TIE for c in candidates)]):
+    if _of_one(zeros) or z**2 < max([Z_THRESHOLD**2, 0.5 * excess, *(c.z**2 * (1 - WEAK_TIE[0]) - TIE for c in candidates)]):
         return None
     effect, *rivals = zeros_of(base.spectra, z, zeros, errors, [e.name for e, _ in adopted])
     cleaned = task.on(recordings=tuple(remove_record_effect(task.recordings, effect, bench.output)))
@@ -206,6 +207,11 @@ def own_zeros(task, adopted, base, candidates):
     return cleaned, (effect, rivals), freed
 
 
+def _of_one(zeros) -> bool:
+    """Whether zeros of the recordings are one for all of them."""
+    return float(np.std(zeros)) < ALIKE * abs(float(np.mean(zeros)))
+
+
 def unsettled_means(task, adopted, slow, best, beside=()):
     """Means that an effect has brought as far in each recording as the drive had run before: set free where they hold most of
     what the fit with this `slow` effect leaves, and so serve better than the `best` of all. Returns the task with free means
@@ -221,6 +227,8 @@ def unsettled_means(task, adopted, slow, best, beside=()):
     excess = excess_of(slow)
     z, zeros, errors = zeros_score(slow.problem, slow.refined)
     cost = len(zeros) * np.log(best.data_count) + BIC_DROP
+    if _of_one(zeros):
+        return None
     if z**2 < max([MEANS_HOLD * excess, *(c.z**2 + cost for c in beside)]) or chi2_of(slow) - z**2 + cost > chi2_of(best):
         return None
     task.say("with means of their own", slow.chi2_per_sample)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magjax.chain.march import AT_FIRST, DISTURBED, ends_taken
+from magjax.chain.shells import distribution
 
 
 class Asked(NamedTuple):
@@ -70,9 +71,10 @@ class Backward:
     def asked(self, signals) -> Asked:
         """What the lines ask of the last period."""
         steps, asked, every = self.marched.steps, self.nothing(signals.shape[1]), np.arange(self.number)
-        relay, mean = steps.relay_field[:, -self.samples :].mean(axis=2), signals[:, :, 1].sum(axis=-1)
+        shares = distribution(self.shells)[1]
+        relay, mean = steps.relay_field[:, -self.samples :] @ shares, signals[:, :, 1].sum(axis=-1)
         for end, slope in zip((relay.argmax(axis=1), relay.argmin(axis=1)), self.marched.unreached.T, strict=True):
-            asked.at[self.older + self.count - self.samples + end, every, 0] += (slope[:, None] * mean)[:, None] / self.shells
+            asked.at[self.older + self.count - self.samples + end, every, 0] += (slope[:, None] * mean)[:, None] * shares[:, None]
         read = np.moveaxis(signals[:, :, :3], (3, 2), (0, 2))
         if self.before:
             asked.after[-self.samples :] = np.roll(read, -1, axis=0)  # the end of a period is its first sample

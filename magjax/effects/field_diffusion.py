@@ -16,7 +16,8 @@ BEGUN = 0.9, 1e-4  # share and time, s, from which a fit of the modes begins
 
 
 class FieldDiffusion(AbstractEffect):
-    """Skin effect of a solid cylinder: shells with their own field and relays in place of one loss k dB/dt for all (`chain.shells`).
+    """Skin effect of a solid cylinder: depths with their own field and relays in place of one loss k dB/dt for all, four nodes of Gauss and
+    Legendre over the section (`chain.shells`).
 
     Sections stay plane: the rod strains by the mean of M^2 over the section. In detail a share `alike` of the variance of M is not
     seen, as where the rod strains by the square of the mean M: a section that magnetizes as one, as lumped models of the skin effect have it.
@@ -40,7 +41,7 @@ class FieldDiffusion(AbstractEffect):
     name = "field_diffusion"
     block = "coil"
     law = (
-        "k dB/dt -> k [(1 - kappa) mean_j dB_j/dt + kappa mean_j D_ij dB_j/dt] in shell i, D_ij = mean of -2 ln max(u, u'), u = (r/R)^2; "
+        "k dB/dt -> k [(1 - kappa) dB/dt + kappa int -2 ln max(u, u') dB(u')/dt du'] at the depth u = (r/R)^2, dB/dt its mean where none is told; "
         "strain by mean m^2, in detail less alike var m; or by the modes of a rod of one permeability, k dB/dt -> k [(1 - kappa) dB/dt + "
         "kappa sum_n (8/j_n^2) lag_n(dB/dt)], lag of (j_1/j_n)^2 tau, J1(j_n) = 0, in detail (j_1/j_n)^(2 - nearer) tau"
     )
