@@ -36,6 +36,7 @@ from .verdict import HALF, Z_THRESHOLD
 
 HUM_Z = 7.0  # what is no hum scored 5.3 at most, of 180 sets of recordings
 DRIFT_Z = 6.0, 8.0  # no drift: 3.4; beside a drift that was taken out, what its form left scored 6.8
+NEARLY = 0.9  # of the score of what is taken out, from which another is its rival
 LASTING_Z = 5.0  # by the noise that is left, flicker that goes on below the records' length: 3.5 at most where nothing drifts, 5.6 at least where it does
 FAR_ZERO = 3.0  # chi2/N from which a sensor's zero need not score highest: far from the first order others do
 MOST_LIKELY = 3  # effects that are fitted where they promise as much as zeros of the recordings
@@ -80,20 +81,32 @@ def record_level(recordings, spectra, bench, choices):
                 without = remove_record_effect(recordings, best, bench.output)
                 cleaned = spectra_of(without, bench, choices.harmonics)
         # one that warms through another node has more shapes than to be a rival of another
-        adopted.append((best, [e for e in found if e.name != best.name and abs(e.z) > 0.9 * abs(best.z) and "taus" not in e.shapes]))
+        rivals = [e for e in found if e.name != best.name and abs(e.z) > NEARLY * abs(best.z) and "taus" not in e.shapes]
+        adopted.append((best, [e for e in rivals if _leaves_as_much(e, best, recordings, bench, choices)]))
         recordings, spectra = without, cleaned
     return adopted, recordings
 
 
+def _left(effect, recordings, bench, choices) -> float:
+    """Minus twice the logarithm of the likelihood of the noise that is left without a record-level effect."""
+    spectra = spectra_of(remove_record_effect(recordings, effect, bench.output), bench, choices.harmonics)
+    return 2 * unlikeliness(spectra, [s.noise for s in spectra])
+
+
 def _leaves_least(best, found, recordings, bench, choices):
     """The best, or of drifts the other one where that leaves likelier noise: one that scores by a few records may make others worse."""
-
-    def left(drift):
-        spectra = spectra_of(remove_record_effect(recordings, drift, bench.output), bench, choices.harmonics)
-        return 2 * unlikeliness(spectra, [s.noise for s in spectra])
-
     others = [e for e in found if best.name in DRIFTS and e.name in set(DRIFTS) - {best.name} and abs(e.z) > DRIFT_Z[0]]
-    return next((e for e in others if left(e) < left(best) - BIC_DROP), best)
+    least = _left(best, recordings, bench, choices) - BIC_DROP if others else -np.inf
+    return next((e for e in others if _left(e, recordings, bench, choices) < least), best)
+
+
+def _leaves_as_much(rival, best, recordings, bench, choices) -> bool:
+    """Whether noise is about as likely without a rival of the best as without that, if one is a hum and the other drifts: each looks like
+    the other, where its form is not asked."""
+    if (rival.name in DRIFTS) == (best.name in DRIFTS):
+        return True
+    least = _left(best, recordings, bench, choices)
+    return _left(rival, recordings, bench, choices) < least + (1 - NEARLY**2) * best.z**2
 
 
 def _lasts(drift, recordings, spectra, bench, choices) -> bool:

@@ -24,7 +24,7 @@ NODE_TIMES = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)  # the same of two nodes
 REVERSES = 0.02  # of the largest rate of a warming, up to which it may seem to turn back
 LONE_GAIN = 60.0  # fall of chi2 from which a drift of one record may be its alone
 SETTLING = (0.04, 0.15)  # of the record's length: times with which such a record may settle
-AS_ALIKE = 1.02  # spread of drifts per heat in units of that of the drifts, up to which they may as well be heat
+AS_ALIKE = 1.15  # spread of drifts per heat in units of that of the drifts, up to which they may as well be heat: of records that begin warm 1.08
 BELOW = 16  # lengths of a record down to which flicker goes on
 OWN_GAIN, OWN_SHARE = 12.0, 0.8  # fall of chi2 by a drift of one record alone, and the share of the longer ones that must show it
 

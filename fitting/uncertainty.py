@@ -99,8 +99,8 @@ def widened(problem, solution, cov, index: int) -> float:
 def estimates(problem, solution, actuator) -> list[Estimate]:
     """Every declared parameter of the fitted actuator with its error.
 
-    At the noise halfway between the fits with and without the floor of the density, and half of what is between them is
-    counted among the errors.
+    At the noise halfway between the fits with and without the floor of the density, half of what is between them is counted among the
+    errors, and these are `widened`.
     """
     layout, z = problem.layout, solution.z
     cov = covariance(solution.normal, z, layout)
@@ -113,7 +113,7 @@ def estimates(problem, solution, actuator) -> list[Estimate]:
         if name in layout.names:
             index, value = layout.index(name), float(layout.value(name, z + half))
             slope = layout.slope(name, solution.z)
-            own = widened(problem, solution, cov, index) * np.sqrt(max(cov[index, index], 0.0))
+            own = (widened(problem, solution, cov, index) if at_noise else 1.0) * np.sqrt(max(cov[index, index], 0.0))
             stderr = widen * abs(slope) * float(np.hypot(own, half[index]))
             reach = max(abs(value), info.scale)
             at_bound = bool(value <= info.low + 1e-9 * reach or value >= info.high - 1e-9 * reach or not inside[index])

@@ -555,9 +555,9 @@ def test_means_are_set_free_where_they_hold_most_of_what_a_slow_effect_leaves(mo
             chi2_per_sample=value, data_count=900, actuator=actuator, problem=None, refined=None, spectra=(), choices=Choices()
         )
 
-    ends = {"freed": 1.1, "z": 42.0}
+    ends = {"freed": 1.1, "z": 42.0, "zeros": (-8.1e-6, 8.8e-6)}
     own = RecordEffect("zero_drift", 42.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
-    monkeypatch.setattr(signals_module, "zeros_score", lambda *a: (ends["z"], np.zeros(2), np.ones(2)))
+    monkeypatch.setattr(signals_module, "zeros_score", lambda *a: (ends["z"], np.asarray(ends["zeros"]), np.ones(2)))
     monkeypatch.setattr(signals_module, "zeros_of", lambda *a: [own])
     monkeypatch.setattr(Task, "fit", lambda task, actuator, **more: result(ends["freed"], "creep"))
     task = Task((Recording(np.arange(40.0), {"current": np.arange(40.0), "displacement": np.arange(40.0)}),), bench)
@@ -565,6 +565,10 @@ def test_means_are_set_free_where_they_hold_most_of_what_a_slow_effect_leaves(mo
     cleaned, found = signals_module.unsettled_means(task, [], result(2.9, "creep"), best)
     assert found == (own, []) and cleaned.recordings[0].origin["zero"] == 1e-5
     assert signals_module.unsettled_means(task, [(own, [])], result(2.9, "creep"), best) is None  # once
+    ends.update(zeros=(-8.1e-6, -8.8e-6))  # one for all, of a reversible part of M: they had been zeros of 8.7 um that change
+    assert signals_module.unsettled_means(task, [], result(2.9, "creep"), best) is None
+    ends.update(zeros=(-5.0e-6, -8.8e-6))
+    assert signals_module.unsettled_means(task, [], result(2.9, "creep"), best) is not None
     assert signals_module.unsettled_means(task, [], result(2.9, "creep"), result(1.2, "backlash")) is None
     assert signals_module.unsettled_means(task, [], result(6.0, "creep"), best) is None  # the best serves better
     other = result(2.3, "coulomb_friction")  # the best may be of any kind, where they promise more than what scores beside it
@@ -597,12 +601,13 @@ def test_a_drift_is_told_once():
 
 
 @pytest.mark.parametrize(
-    ("drift", "freed", "free"), [(True, 4.0, True), (False, 4.0, False), (False, 1.0, True), (True, 150.0, False)],
-    ids=["beside a drift", "no drift", "all of it", "too little"],
+    ("drift", "freed", "other", "free"),
+    [(True, 4.0, -5.0, True), (False, 4.0, -5.0, False), (False, 1.0, -5.0, True), (True, 150.0, -5.0, False), (False, 1.0, 4.9, False)],
+    ids=["beside a drift", "no drift", "all of it", "too little", "one for all"],
 )  # fmt: skip
-def test_means_go_with_a_drift_where_they_hold_nearly_all(monkeypatch, bench, drift, freed, free):
+def test_means_go_with_a_drift_where_they_hold_nearly_all(monkeypatch, bench, drift, freed, other, free):
     own = RecordEffect("zero_drift", 90.0, 1e-6, 1e-9, {"zeros": 1e-5}, ())
-    monkeypatch.setattr(signals_module, "zeros_score", lambda *a: (800.0, np.zeros(2), np.ones(2)))
+    monkeypatch.setattr(signals_module, "zeros_score", lambda *a: (800.0, np.asarray([5e-6, other * 1e-6]), np.ones(2)))
     monkeypatch.setattr(signals_module, "zeros_of", lambda *a: [own])
     ended = a_fit(freed, 60.0)
     monkeypatch.setattr(Task, "fit", lambda task, actuator: ended)

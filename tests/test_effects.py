@@ -20,6 +20,7 @@ from magjax.chain import BLOCKS, Timeline, newton
 from magjax.chain.march import magnetize
 from magjax.chain.mechanics import Mechanics
 from magjax.effects import CATALOGUE, AbstractEffect
+from magjax.effects.base import Trial
 from magjax.effects.field_diffusion import ZEROS, DiffusionModes
 from magjax.errors import ConfigurationError
 from magjax.simulate import run_chain, simulate
@@ -577,6 +578,7 @@ def test_smooth_friction_approaches_coulomb():
     [
         effects.SecondEddyPath(kappa=0.5, tau=3e-3, air=0.0),
         effects.SecondEddyPath(kappa=0.05, tau=1e-2, air=1.0),
+        effects.SecondEddyPath(kappa=0.5, tau=3e-3, air=0.0, spread=1.0),
         effects.MagneticAftereffect(share=0.1, of_field=0.0),
         effects.MagneticAftereffect(share=0.1, of_field=1.0),
     ],
@@ -657,3 +659,18 @@ def test_thresholds_widen_by_the_relays_own_rate_or_by_that_of_the_applied_field
     law = gamma * ((1 - of_drive) * np.arcsinh(own / rate0) + of_drive * np.arcsinh(driven / rate0) * own / np.hypot(own, rate0))
     assert np.asarray(H - v)[1:] == pytest.approx(law, abs=1e-6 * gamma) and np.abs(law).max() > gamma
     assert np.abs(residual).max() < 1e-5
+
+
+def test_half_of_a_second_path_has_its_own_time_in_detail():
+    act, h, steps = actuator(20), 1e-5, 300
+    effect = effects.SecondEddyPath(kappa=0.3, tau=2e-3, spread=1.0)
+    trial = Trial(*(jnp.asarray(x) for x in (0.0, 0.0, 1.0, 0.0, 0.0)), h)  # dB/dt of 1 T/s from the first step on
+    state = effect.start(trial, act)
+    state = (*state[:2], act.coil.loss * jnp.asarray(1.0), *state[3:])
+    for _ in range(steps):
+        field = effect.field_shift(trial, state, act)
+        state = effect.advance(trial, state, act)
+    slow, early = (1 - np.exp(-steps * h / tau) for tau in (2e-3, 2e-4))
+    assert float(field) == pytest.approx(0.3 * float(act.coil.loss) * (slow + early) / 2, rel=1e-3)
+    plain = effects.SecondEddyPath(kappa=0.3, tau=2e-3)
+    assert plain.in_detail() is not None and bool(jnp.all(jnp.asarray(plain.start(trial, act)[:2]) == 0.0))

@@ -147,6 +147,25 @@ def test_a_repair_that_errs_as_it_expects_may_be_named(white, before, says, foun
 
 
 @pytest.mark.parametrize(
+    ("before", "left", "alone", "says", "found"),
+    [
+        (571.0, 0.96, True, 1460.0, True), (40.0, 0.96, True, 1460.0, False), (571.0, 1.2, True, 1460.0, False), (571.0, 0.96, False, 1460.0, False),
+        (571.0, 0.96, True, 9.0, False), (571.0, 0.96, True, None, False),
+    ],
+)  # fmt: skip
+def test_what_alone_takes_a_large_misfit_to_the_noise_is_named_though_checks_are_missed(monkeypatch, before, left, alone, says, found):
+    """A second mode of 1.5 % beside a mean field on a density of sharp ridges: chi2/N 571 to 0.96, check recordings missed by 60 times
+    their noise for 37."""
+    from fitting import verdict
+
+    monkeypatch.setattr(verdict, "dominant", lambda evidence: alone)
+    foretell = None if says is None else SimpleNamespace(says_for=lambda after, plain: says)
+    fits = [SimpleNamespace(chi2_per_sample=chi2) for chi2 in (before, left)]
+    evidence = SimpleNamespace(plain=fits[0], reached=SimpleNamespace(foretell=foretell, current=fits[1]))
+    assert verdict.settles(evidence) == found
+
+
+@pytest.mark.parametrize(
     ("white", "says", "found"),
     [(1.06, -8.7, True), (1.06, -17.0, False), (1.06, 3.0, True), (1.6, -8.7, False), (None, None, False)],
 )

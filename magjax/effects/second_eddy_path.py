@@ -9,7 +9,10 @@ from .lags import lagged, repeated
 
 
 class SecondEddyPath(AbstractEffect):
-    """A shorted turn that links the flux of the rod or, `air`, that of the coil beside it: two limits with all between."""
+    """A shorted turn that links the flux of the rod or, `air`, that of the coil beside it: two limits with all between.
+
+    In detail half of its field is early by `spread` decades of its time: of two turns, or of a wall so thick that the field diffuses in.
+    """
 
     kappa: Float[Array, ""] = param(
         0.0, "1", "its field relative to the rod's eddy field, or to the coil's", low=0.0, scale=0.3, null=0.0, typical=(0.02, 2.0)
@@ -25,10 +28,13 @@ class SecondEddyPath(AbstractEffect):
         shape=True,
         typical=(0.0, 1.0),
     )
+    spread: Float[Array, ""] = param(
+        0.0, "1", "decades by which half of its field has a shorter time", low=0.0, high=3.0, scale=0.3, shape=True, detail=True, typical=(0.0, 1.5)
+    )
 
     name = "second_eddy_path"
     block = "coil"
-    law = "H + k dB/dt + H2 = applied, tau dH2/dt + H2 = kappa ((1 - air) k dB/dt + air tau d(applied)/dt)"
+    law = "H + k dB/dt + H2 = applied, tau dH2/dt + H2 = kappa ((1 - air) k dB/dt + air tau d(applied)/dt); in detail H2 is the mean of two, the other of tau / 10^spread"
     source = "lumped model of a conducting housing (shorted secondary winding)"
     signature = "an extra eddy lag that saturates above 1/(2 pi tau)"
     amplitude = "kappa"
@@ -40,24 +46,30 @@ class SecondEddyPath(AbstractEffect):
         return bool(self.kappa * self.air <= 1)
 
     def start(self, trial, actuator):
-        """No current flows: its field over kappa, what drives it, the applied field, the integral of the drive."""
+        """No current flows: the fields of its halves over kappa, what drives it, the applied field, the integral of the drive."""
         zero = jnp.zeros_like(trial.field)
-        return (zero, zero, zero + actuator.coil.applied_field(trial.current), zero)
+        return (zero, zero, zero, zero + actuator.coil.applied_field(trial.current), zero)
+
+    @property
+    def _times(self):
+        return self.tau, self.tau * 10.0**-self.spread
 
     def _driven(self, trial, state, actuator):
         applied = actuator.coil.applied_field(trial.current)
-        change = (1 - self.air) * actuator.coil.loss * trial.flux_rate + self.air * self.tau * (applied - state[2]) / trial.h
-        return lagged(state[0], state[1], change, trial.h, self.tau), change, applied, state[3] + trial.h * change
+        change = (1 - self.air) * actuator.coil.loss * trial.flux_rate + self.air * self.tau * (applied - state[3]) / trial.h
+        halves = (lagged(x, state[2], change, trial.h, tau) for x, tau in zip(state[:2], self._times, strict=True))
+        return *halves, change, applied, state[4] + trial.h * change
 
     def field_shift(self, trial, state, actuator):
         """Field of the second path, A/m."""
-        return self.kappa * self._driven(trial, state, actuator)[0]
+        slow, early, *_ = self._driven(trial, state, actuator)
+        return self.kappa * 0.5 * (slow + early)
 
     def advance(self, trial, state, actuator):
-        """Its field over kappa and the rest after the step."""
+        """Its fields over kappa and the rest after the step."""
         return self._driven(trial, state, actuator)
 
     def settled(self, state, before, period):
         """Its field where it repeats, the flux that the first periods leave behind taken off."""
-        left = (state[3] - before[3]) / period
-        return (repeated(state[0], before[0], period, self.tau) - left, *state[1:])
+        left = (state[4] - before[4]) / period
+        return *(repeated(x, y, period, tau) - left for x, y, tau in zip(state[:2], before[:2], self._times, strict=True)), *state[2:]
