@@ -41,7 +41,7 @@ class FieldDiffusion(AbstractEffect):
     name = "field_diffusion"
     block = "coil"
     law = (
-        "k dB/dt -> k [(1 - kappa) dB/dt + kappa int -2 ln max(u, u') dB(u')/dt du'] at the depth u = (r/R)^2, dB/dt its mean where none is told; "
+        "k mean dB/dt -> k [(1 - kappa) mean dB/dt + kappa int_0^1 -2 ln max(u, u') dB(u')/dt du'] at the depth u = (r/R)^2; "
         "strain by mean m^2, in detail less alike var m; or by the modes of a rod of one permeability, k dB/dt -> k [(1 - kappa) dB/dt + "
         "kappa sum_n (8/j_n^2) lag_n(dB/dt)], lag of (j_1/j_n)^2 tau, J1(j_n) = 0, in detail (j_1/j_n)^(2 - nearer) tau"
     )
