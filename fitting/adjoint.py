@@ -195,6 +195,7 @@ def as_lines(rows) -> np.ndarray:
     return lines
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a trial that has left all reason; the solver sees that its numbers are none
 def rows_of(marched: Marched, signals: np.ndarray, read: np.ndarray) -> Rows:
     """Led back through the marches, from the last step to the first; arguments as in `Rows`, in NumPy.
 

@@ -207,8 +207,9 @@ def _solve(table, c, rod, actuator, trial_of, current, rhs):
         good = (along <= OVERSHOOT * descent) | (scale < 1e-6)
         v = jnp.where(good, v + scale * step, v)
         fresh = -inverse_of_definite(J) @ F
+        shorter = scale * jnp.clip(jnp.nan_to_num(descent / (descent + along)), *SHORTER)
         step, descent = jnp.where(good, fresh, step), jnp.where(good, -jnp.sum(weights * F * rise * fresh), descent)
-        return v, step, descent, jnp.where(good, 1.0, scale * jnp.clip(descent / (descent + along), *SHORTER)), jnp.where(good, jnp.max(jnp.abs(F)), jnp.inf), number + 1
+        return v, step, descent, jnp.where(good, 1.0, shorter), jnp.where(good, jnp.max(jnp.abs(F)), jnp.inf), number + 1
 
     reach = 0.5 * fixed[0].step * fixed[0].cells
     start = fixed[1].memory.field
