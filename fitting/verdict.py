@@ -38,7 +38,7 @@ NO_BETTER = (3.0, 10.0, 0.8)  # chi2/N and check recordings' misfit from which w
 WORSE = (1.1, 0.3)  # times the check recordings' misfit before, and more by so much a recording, that a repair may leave
 AS_EXPECTED = 3.0  # chi2 per number of check recordings in units of what the fit expects to miss: there it errs as it says it does;
 NEARER = (6.0, 0.3), (12.0, 0.1)  # or within this, and this share of the plain fit's
-SETTLES = 50.0, 1.1  # chi2/N of a misfit, and what one effect leaves that takes all of it: check recordings that speak for it need not be met
+SETTLES = 50.0, 1.1  # chi2/N of a misfit and of all others' fits, and what one effect leaves that takes all of it: check recordings need not be met then
 SAYS_FOR = 10.0  # what these then say for a repair, as a fall of chi2, though their errors rise
 EXPECTED, AGAINST = 1.5, 0.1  # chi2 per number in these units, up to which a repair errs as it expects; share of its fall that they may speak against it
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
@@ -192,14 +192,20 @@ def as_expected(evidence) -> bool:
 
 
 def settles(evidence) -> bool:
-    """Whether one effect alone takes a large misfit down to the noise, none of the others nearly as much, and the check recordings speak for it.
-
-    What they are missed by as far as before, or farther, is then the density's, in cells that no recording switched.
+    """Whether one effect alone takes a large misfit down to the noise, none that was fitted in its place came anywhere near that, and
+    the check recordings speak for it. What they are missed by as far as before, or farther, is then the density's, in cells that no
+    recording switched.
     """
-    foretell, current, plain = evidence.reached.foretell, evidence.reached.current, evidence.plain
-    if not foretell or plain.chi2_per_sample < SETTLES[0] or current.chi2_per_sample > SETTLES[1] or not dominant(evidence):
+    reached, plain = evidence.reached, evidence.plain
+    if not reached.foretell or len(reached.steps) != 1 or reached.partial:
         return False
-    return foretell.says_for(current, plain) > SAYS_FOR
+    far, met = SETTLES
+    best = reached.steps[0][0].name
+    others = [c.achieved_chi2_drop for c in reached.tried.values() if c.achieved_chi2_drop is not None and c.name != best]
+    nearest = (chi2_of(plain) - max(others, default=np.inf)) / plain.data_count
+    if min(plain.chi2_per_sample, nearest) < far or reached.current.chi2_per_sample > met:
+        return False
+    return reached.foretell.says_for(reached.current, plain) > SAYS_FOR
 
 
 def hardly_against(evidence) -> bool:
