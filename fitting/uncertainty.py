@@ -4,9 +4,6 @@ import dataclasses
 
 import numpy as np
 
-from .joint import data_residual, prior_matrix
-from .solver import cost_of
-
 WIDEN = 1.3  # stated errors are widened by this: the evidence weights take the roughness for granted
 WIDEN_BESIDE = 2.6  # the same beside an effect: its law's form is taken for granted too
 GAUGES = {  # free without a prior beside free masses, and why nothing holds them
@@ -79,6 +76,9 @@ def widened(problem, solution, cov, index: int) -> float:
     Steep loops of soft materials move by less than a sample of the Jacobian's grid, whose slopes then promise more than the fine
     grid keeps. The others follow as their covariance `cov` says; 1 at least.
     """
+    from .joint import data_residual, prior_matrix  # with JAX, which a report made anew does not need
+    from .solver import cost_of
+
     layout, z = problem.layout, solution.z
     if not cov[index, index] > 0:
         return 1.0

@@ -893,10 +893,10 @@ def test_an_error_goes_as_far_as_the_fine_grid_lets_it(monkeypatch, flat, factor
     """A misfit that does not move within `flat` standard errors of the Jacobian's; of what nothing holds, eight times the error is said, and more."""
     layout = SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf)))
     solution = SimpleNamespace(z=np.zeros(2), weights=())
-    monkeypatch.setattr("fitting.uncertainty.prior_matrix", lambda *_: np.zeros((2, 2)))
+    monkeypatch.setattr("fitting.joint.prior_matrix", lambda *_: np.zeros((2, 2)))
     cov = np.diag([4.0, 9.0])
     monkeypatch.setattr(
-        "fitting.uncertainty.data_residual", lambda _, z: np.append(np.sign(z[0]) * max(abs(z[0]) / 2 - flat, 0.0), z[1] / 3)
+        "fitting.joint.data_residual", lambda _, z: np.append(np.sign(z[0]) * max(abs(z[0]) / 2 - flat, 0.0), z[1] / 3)
     )
     problem = SimpleNamespace(layout=layout)
     assert widened(problem, solution, cov, 0) == pytest.approx(factor)
