@@ -73,8 +73,8 @@ def floor_shift(problem, solution) -> np.ndarray:
 def widened(problem, solution, cov, index: int) -> float:
     """By how much the standard error of an unknown must be wider for the cost on the fine grid to rise by a half at its ends.
 
-    Steep loops of soft materials move by less than a sample of the Jacobian's grid, whose slopes then promise more than the fine
-    grid keeps. The others follow as their covariance `cov` says; 1 at least.
+    The slope on the Jacobian's grid may promise more than a step of the size of an error changes on the fine one: on the measured loops of
+    a rod three times as much, whatever the plane's cells. The others follow as their covariance `cov` says; 1 at least.
     """
     from .joint import data_residual, prior_matrix  # with JAX, which a report made anew does not need
     from .solver import cost_of

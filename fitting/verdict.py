@@ -200,9 +200,7 @@ def settles(evidence) -> bool:
     if not reached.foretell or len(reached.steps) != 1 or reached.partial:
         return False
     far, met = SETTLES
-    best = reached.steps[0][0].name
-    others = [c.achieved_chi2_drop for c in reached.tried.values() if c.achieved_chi2_drop is not None and c.name != best]
-    nearest = (chi2_of(plain) - max(others, default=np.inf)) / plain.data_count
+    nearest = min(_left_by_others(evidence, reached.steps[0][0].name), default=0.0) / plain.data_count
     if min(plain.chi2_per_sample, nearest) < far or reached.current.chi2_per_sample > met:
         return False
     return reached.foretell.says_for(reached.current, plain) > SAYS_FOR
@@ -217,6 +215,12 @@ def hardly_against(evidence) -> bool:
     return foretell.says_for(current, plain) > -AGAINST * (chi2_of(plain) - chi2_of(current))
 
 
+def _left_by_others(evidence, name) -> list[float]:
+    """What the effects left that were fitted in the place of the one of this name, chi2."""
+    tried = [c for c in evidence.reached.tried.values() if c.achieved_chi2_drop is not None and c.name != name]
+    return [chi2_of(evidence.plain) - c.achieved_chi2_drop for c in tried]
+
+
 def dominant(evidence) -> bool:
     """Whether the one effect found leaves far less than any other that was fitted in its place: what it leaves is then its
     law's form. Physics outside the catalogue is taken up by several effects, one about as well as the next."""
@@ -224,8 +228,7 @@ def dominant(evidence) -> bool:
     if len(steps) != 1 or evidence.reached.partial:  # others were not fitted then
         return False
     best, _, good, _ = steps[0]
-    tried = [c for c in evidence.reached.tried.values() if c.achieved_chi2_drop is not None and c.name != best.name]
-    left = [chi2_of(evidence.plain) - c.achieved_chi2_drop for c in tried]
+    left = _left_by_others(evidence, best.name)
     # of trials that were ended early: what they might have come to
     left += [
         chi2_of(t.result) - PROMISES * t.result.solution.decrement for t in good if t.name != best.name and not t.result.converged
