@@ -178,6 +178,9 @@ def follows_nothing(recording: Recording, channel: str) -> bool:
     return shared < (1 + 6 * np.sqrt(2 / blocks.shape[1])) * noise / len(blocks)
 
 
+UNLIKE = 2e-3  # of a drive's power, by which its periods may differ: where they do by more, they may be parts of longer ones, as of two tones of like pitch
+
+
 def refuse_constant(name: str, channel: str, values: np.ndarray):
     """Raise `RecordingError` where a channel, (time,), never changes."""
     if np.ptp(values) == 0:
@@ -236,7 +239,8 @@ def _repetition(x, dt):
             if len(peaks):
                 lag = below[0] + peaks[0]
                 found = _refine(x, dt, 1.0 / (lag * dt), 1.0 / (lag**2 * dt))
-                return found if 2 * lag < n or not _closes(x) else _better(x, dt, 1.0 / (n * dt), found)
+                unlike = 2 * lag >= n or _leftover(x, dt, found)(found) > UNLIKE * float(x @ x)
+                return _better(x, dt, found) if unlike and _closes(x) else found
     return 1.0 / (n * dt) if _closes(x) else None
 
 
@@ -256,10 +260,16 @@ def _closes(x) -> bool:
     return bool(abs(x[0] - x[-1]) < 4 * np.abs(np.diff(x)).max() and abs(seam) < 3 * np.abs(bends).max())
 
 
-def _better(x, dt, longer, shorter):
-    """The longer of two periods (both as frequencies, Hz) where its harmonics leave far less of x; else the shorter."""
-    left, left_else = (_leftover(x, dt, f)(f) + 1e-12 * float(x @ x) for f in (longer, shorter))
-    return longer if left < 0.3 * left_else else shorter
+def _better(x, dt, found):
+    """The shortest period that the whole record holds some of, longer than that of `found`, Hz, where its harmonics leave far less of x and no
+    more than those of the whole record do; else `found`."""
+    whole = 1.0 / (len(x) * dt)
+
+    def left(f):
+        return _leftover(x, dt, f)(f) + 1e-12 * float(x @ x)
+
+    most = min(0.3 * left(found), 1.2 * left(whole))
+    return next((k * whole for k in range(max(1, int(found / whole / 1.5)), 0, -1) if left(k * whole) <= most), found)
 
 
 def _leftover(x, dt, f, most: int = 5):
