@@ -261,14 +261,14 @@ def _closes(x) -> bool:
 
 
 def _better(x, dt, found):
-    """The shortest period that the whole record holds some of, longer than that of `found`, Hz, where its harmonics leave far less of x and no
-    more than those of the whole record do; else `found`."""
+    """The shortest period that the whole record holds some of, longer than that of `found`, Hz, where its harmonics leave far less of x;
+    else `found`."""
     whole = 1.0 / (len(x) * dt)
 
     def left(f):
         return _leftover(x, dt, f)(f) + 1e-12 * float(x @ x)
 
-    most = min(0.3 * left(found), 1.2 * left(whole))
+    most = 0.3 * left(found)
     return next((k * whole for k in range(max(1, int(found / whole / 1.5)), 0, -1) if left(k * whole) <= most), found)
 
 
