@@ -210,11 +210,11 @@ def credited(candidate, result, base, effect, excess) -> Trial:
     if not np.isfinite(result.chi2_per_sample):
         return Trial(candidate, result, 0.0, np.inf, False, 0.0)
     drop = chi2_of(base) - chi2_of(result)
-    physical = all(_physical(e) and e.is_seen(highest_line(result)) for e in result.actuator.effects)
+    itself = all(is_physical(e) and e.is_seen(highest_line(result)) for e in result.actuator.effects)
     number = len(effect.free_parameters())
     extra = number * np.log(result.data_count)
     tested = dataclasses.replace(candidate, achieved_chi2_drop=float(drop), bic_change=float(extra - drop))
-    return Trial(tested, result, float(drop), float(extra - drop), bool(physical), float(drop / max(excess, 1e-9)), number)
+    return Trial(tested, result, float(drop), float(extra - drop), bool(itself), float(drop / max(excess, 1e-9)), number)
 
 
 def highest_line(result) -> float:
@@ -222,7 +222,7 @@ def highest_line(result) -> float:
     return max((s.frequency * (len(s.reading) - 1) for s in result.spectra), default=np.inf)
 
 
-def _physical(effect) -> bool:
+def is_physical(effect) -> bool:
     """Whether an effect's amplitude has a sign and a size that it can have, and it is what it is named for; an amplitude that
     ends in a bound of its own may run on."""
     info, amplitude = effect.parameters()[effect.amplitude], float(getattr(effect, effect.amplitude))

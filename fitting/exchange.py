@@ -11,7 +11,9 @@ import numpy as np
 from magjax.effects import SensorLag
 
 from .attribute import (
+    BIC_DROP,
     COMPANIONS,
+    FORM_ERROR,
     MIN_DROP,
     MISFIT,
     MISFIT_TIE,
@@ -20,6 +22,7 @@ from .attribute import (
     chi2_of,
     credited,
     excess_of,
+    is_physical,
     leaders,
     rivals_of,
     taken_beside,
@@ -38,12 +41,14 @@ PROMISED_ANEW = 0.8  # of what an effect has brought beside the others, that ano
 NOTHING = 2.0  # standard errors within which an amplitude is none
 
 
-def backward(task, state, made_up=None):
-    """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open.
+def backward(task, state, made_up=None, last_too: bool = False):
+    """Drop an effect adopted early that later ones have made needless: it must still take half of what it leaves open, and where the
+    others all but meet the noise more than the form of their laws may leave.
     `made_up`: the candidate of `state.form`, which takes the place of what it has made needless.
 
     The form error of a right effect looks like another effect until the rest is in place. So is the last one dropped where it
-    has come out as nothing: what it seemed to take, the others took when they were fitted once more beside it.
+    has come out as nothing: what it seemed to take, the others took when they were fitted once more beside it; `last_too`: or as the
+    others are, where these are not those that it was adopted beside.
     """
     for step in state.steps[::-1]:
         name = step[0].name
@@ -51,13 +56,14 @@ def backward(task, state, made_up=None):
         if name not in {e.name for e in actuator.effects}:
             continue
         last = step is state.steps[-1] and not state.form
-        if last and (len(state.steps) == 1 or not _nothing(state.current, name)):
+        if last and (len(state.steps) == 1 or not (last_too or _nothing(state.current, name))):
             continue
         task.say(f"without {name}", state.current.chi2_per_sample)
-        most = max(chi2_of(state.current) + MIN_DROP, chi2_of(state.current) + excess_of(state.current, NULL_CHI2))
+        form = FORM_ERROR * (chi2_of(state.steps[0][3]) - chi2_of(state.current))
+        most = chi2_of(state.current) + max(MIN_DROP, excess_of(state.current, NULL_CHI2), form)
         trial = task.fit_on(state.current, actuator.without_effect(name), target=most)
         rise = chi2_of(trial) - chi2_of(state.current)
-        if rise < max(MIN_DROP, HALF * excess_of(trial, NULL_CHI2)):
+        if rise < max(MIN_DROP, HALF * excess_of(trial, NULL_CHI2), form if trial.chi2_per_sample < MISFIT else 0.0):
             state.current = trial
             if state.form:
                 index = state.steps.index(step)
@@ -103,7 +109,8 @@ def _exchanged(task, state, index, check=()) -> bool:
     best, _, good, previous = state.steps[index]
     behind = max(NEAR_RIVAL * chi2_of(best.result), NEAR_SHARE * best.drop)
     others = {e.name for e in state.current.actuator.effects} - {best.name}
-    near = [t for t in good if t is not best and t.name not in others and t.bic_change < best.bic_change + behind]
+    like = COMPANIONS.get(best.name, ())  # however far they ended alone: as no rivals they were not fitted to their end
+    near = [t for t in good if t is not best and t.name not in others and (t.name in like or t.bic_change < best.bic_change + behind)]
     if best.name not in {e.name for e in state.current.actuator.effects}:
         return False
     rest = dataclasses.replace(state.current, actuator=state.current.actuator.without_effect(best.name))
@@ -121,11 +128,42 @@ def _exchanged(task, state, index, check=()) -> bool:
 
     for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
         trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
+    wrong = min((t for t in trials if not t.physical), key=lambda t: t.bic_change, default=None)
     trials = [t for t in trials + fresh if t.physical]
     found = min(trials, key=lambda t: t.bic_change)
     state.steps[index] = (found, rivals_of(found, trials, others=taken_beside(state.steps, index)), trials, previous)
     state.current = found.result
+    if len(state.steps) == 2 and wrong is not None and wrong.bic_change < found.bic_change - BIC_DROP:
+        return _beside_unphysical(task, state, index, wrong) or found.name != best.name
     return found.name != best.name
+
+
+def _beside_unphysical(task, state, index, wrong) -> bool:
+    """Rivals of the other of two effects beside one that would serve better in this place, if that other one were not unphysical there:
+    it stood for one of its like. Whether two of them have been adopted."""
+    best, _, good, previous = state.steps[index]
+    other, _, seconds, before = state.steps[1 - index]
+    if not is_physical(wrong.result.actuator.effect(wrong.name)):
+        return False
+    task.say(f"{wrong.name} in place of {best.name} beside another than {other.name}", state.current.chi2_per_sample)
+    rest = dataclasses.replace(wrong.result, actuator=wrong.result.actuator.without_effect(other.name))
+    like = COMPANIONS.get(other.name, ())
+    seconds = sorted((t for t in seconds if t.name not in (other.name, wrong.name)), key=lambda t: (t.name not in like, t.bic_change))
+
+    def beside(t):
+        return lambda say: to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP, chi2_of(state.current))
+
+    tried = together([beside(t) for t in seconds[:MOST_RIVALS]], task.progress)
+    tried = [dataclasses.replace(trial, explained_share=t.explained_share) for t, trial in zip(seconds, tried, strict=False) if trial.physical]
+    found, of_one = min(tried, key=lambda t: t.bic_change, default=None), np.log(state.current.data_count)
+    more = 0 if found is None else wrong.parameters + found.parameters - best.parameters - other.parameters
+    if found is None or chi2_of(found.result) + more * of_one > chi2_of(state.current) - BIC_DROP:
+        return False
+    own = dataclasses.replace(wrong, result=found.result, physical=True, explained_share=best.explained_share)
+    state.steps[index] = (own, [own], [own, *(t for t in good if t.name != own.name)], previous)
+    state.steps[1 - index] = (found, rivals_of(found, tried, others=taken_beside(state.steps, 1 - index)), tried, before)
+    state.current = found.result
+    return True
 
 
 def _promised_anew(task, current, rest, known, check) -> list[Trial]:

@@ -104,8 +104,8 @@ def _once_more(task, state, made_up, scored, check, ends):
     """What was adopted, once more beside what came later."""
     if state.current.chi2_per_sample < FAR_FROM_NOISE:
         backward(task, state, made_up)
-        if state.current is not state.exchanged:
-            exchange(task, state, check)
+        if state.current is not state.exchanged and exchange(task, state, check) and not state.form:
+            backward(task, state, last_too=True)
         if commuted(task, state, scored.get("sensor_lag")):
             exchange(task, state, check)
     if state.steps and state.current is not state.steps[-1][0].result:
@@ -152,6 +152,12 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
             break
         if _not_confirmed(state, best, excess, check):
             break
+        if _another_pair_at_hand(task, state, best, good, check):
+            best = state.steps[-1][0]
+            candidates = screened(state.current, task.choices)
+            if ends(state.current) or best.name not in SLOW and free_means(state.current, state.current, candidates):
+                return task, made_up, True
+            continue
         left = screened(best.result, task.choices)
         if best.name not in SLOW and free_means(best.result, best.result, left):
             return task, made_up, True
@@ -169,9 +175,25 @@ def _forward(task, base, state, candidates, any_rest, check, ends, free_means):
     return task, made_up, False
 
 
+def _another_pair_at_hand(task, state, best, good, check) -> bool:
+    """Whether rivals serve better together than those found and a second one that leaves a misfit, and are adopted in their place: asked
+    before means of their own and finer densities are tried, which would take up what a wrong pair leaves."""
+    if len(state.steps) != 1 or not MISFIT < best.result.chi2_per_sample < FAR_FROM_NOISE:
+        return False
+    steps, current = list(state.steps), state.current
+    state.adopt(best, good)
+    changed = exchange(task, state, check)
+    state.exchanged = state.current
+    if not changed:
+        state.steps, state.current = steps, current
+    return changed
+
+
 def _of_another_pair(task, base, state, candidates, check) -> list:
     """The scores beside the effects found: two that leave a misfit are exchanged for rivals where these leave less. Far from the noise
     the first one gives way to a rival with which one of its own leaders comes nearer, and the next round finds that one."""
+    if state.current is state.exchanged:
+        return candidates
     if MISFIT < state.current.chi2_per_sample < FAR_FROM_NOISE:
         changed = exchange(task, state, check)
         state.exchanged = state.current

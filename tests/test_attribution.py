@@ -12,7 +12,7 @@ import fitting.exchange
 import fitting.search
 import fitting.trials
 import fitting.verdict
-from fitting.attribute import Trial, _physical, chi2_of, confidence, credited, excess_of, family, leaders, rivals_of, tie_of
+from fitting.attribute import Trial, chi2_of, confidence, credited, excess_of, family, is_physical, leaders, rivals_of, tie_of
 from fitting.density import Stiffness
 from fitting.diagnosis import Evidence
 from fitting.exchange import both_found
@@ -714,7 +714,7 @@ def test_a_repair_beside_a_rough_density_is_named_where_it_foretells_the_checks(
 )  # fmt: skip
 def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
     """One far beyond what is typical imitates another law; a share that has reached its bound may run on."""
-    assert _physical(CLASSES[name]().with_amplitude(amplitude)) == physical
+    assert is_physical(CLASSES[name]().with_amplitude(amplitude)) == physical
 
 
 @pytest.mark.parametrize(
@@ -729,7 +729,7 @@ def test_an_amplitude_has_a_sign_and_a_size(name, amplitude, physical):
 )  # fmt: skip
 def test_a_sensors_curve_rises_over_its_range(curve, physical):
     """A curve on cells had come to fall beside a creep, R_eddy to half of its value; as a constant it may be any."""
-    assert _physical(CLASSES["sensor_nonlinearity"](**curve)) is physical
+    assert is_physical(CLASSES["sensor_nonlinearity"](**curve)) is physical
 
 
 @pytest.mark.parametrize(
@@ -755,7 +755,7 @@ def test_a_sensors_curve_rises_over_its_range(curve, physical):
 def test_a_law_bent_into_another_is_not_named(effect, physical):
     """An overdamped mode imitated a structural damping beside a crosstalk, a spring of the fifth power an end stop, friction that
     is viscous throughout a delay beside a creep, a turn round the coil that opposes more than its field an amplifier's lag of two poles."""
-    assert _physical(effect) is physical
+    assert is_physical(effect) is physical
 
 
 @pytest.mark.parametrize(("f2", "physical"), [(900.0, True), (28000.0, False)])
@@ -1093,13 +1093,65 @@ def test_the_last_effect_is_dropped_where_it_has_come_out_as_nothing(value, left
         effects=effects, effect=lambda name: next(e for e in effects if e.name == name), without_effect=lambda name: name
     )
     found = Fitted(1.04, actuator)
-    state = Reached(found, [(trial(e.name, 1.04), [], [], None) for e in effects], {})
+    state = Reached(found, [(trial(e.name, 1.04), [], [], Fitted(4.0, actuator)) for e in effects], {})
 
     def without(current, fewer, target):
         return Fitted(left if fewer == "magnetic_aftereffect" else 9.0, actuator)
 
     fitting.exchange.backward(SimpleNamespace(say=lambda *a: None, fit_on=without), state)
     assert [step[0].name for step in state.steps] == ["rate_dependent_switching", "magnetic_aftereffect"][:kept]
+
+
+@pytest.mark.parametrize(
+    ("plain", "left", "named"),
+    [(374.0, 1.07, ["duffing_stiffness"]), (10.0, 1.07, ["delta_e", "duffing_stiffness"]), (374.0, 1.4, ["delta_e", "duffing_stiffness"])],
+    ids=["as little as a form", "more", "a misfit"],
+)
+def test_an_early_effect_that_takes_as_little_as_the_others_form_leaves_is_dropped(monkeypatch, plain, left, named):
+    """A duffing_stiffness of 4.5 %, whose law saturated, took 374 to 1.07 on finer hats; a delta_e found first, beside which it took 0.98, was
+    named with it."""
+    effects = tuple(CLASSES[name]() for name in ("delta_e", "duffing_stiffness"))
+
+    def fitted(chi2n, *left):
+        actuator = SimpleNamespace(effects=left or effects, without_effect=lambda name: [e for e in effects if e.name != name])
+        return SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=actuator)
+
+    first, second = trial("delta_e", 60.0, base=plain), trial("duffing_stiffness", 0.98, base=60.0)
+    state = Reached(fitted(0.98), [(first, [first], [first], fitted(plain)), (second, [second], [second], fitted(60.0))], {})
+    targets = []
+    monkeypatch.setattr(fitting.exchange, "_nothing", lambda result, name: False)
+
+    def fit_on(current, fewer, target):
+        targets.append(target)
+        return fitted(left, *fewer)
+
+    fitting.exchange.backward(SimpleNamespace(say=lambda *a: None, fit_on=fit_on), state)
+    assert [step[0].name for step in state.steps] == named and state.current.chi2_per_sample == (left if len(named) == 1 else 0.98)
+    assert targets == [pytest.approx((0.98 + max(25 / COUNT, 0.03, 0.005 * (plain - 0.98))) * COUNT)]  # no fit that may serve ends early
+
+
+@pytest.mark.parametrize(("changed", "number"), [(True, 2), (False, 3)], ids=["other ones", "the same"])
+def test_the_last_effect_is_asked_for_once_more_where_others_are_not_those_it_was_adopted_beside(monkeypatch, changed, number):
+    """A second_mode took 1.30 to 0.95 beside a field that diffuses; beside the second path in its place, 1.04, it had nothing to do."""
+    effects = tuple(CLASSES[name]() for name in ("excess_loss", "second_eddy_path", "second_mode"))
+
+    def fitted(chi2n, left=effects):
+        actuator = SimpleNamespace(effects=left, without_effect=lambda name: tuple(e for e in left if e.name != name))
+        return SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, actuator=actuator)
+
+    plain, ended = fitted(309.0), fitted(0.95)
+    steps = [(trial(n, 1.0, base=309.0), [], [], plain) for n in ("excess_loss", "second_eddy_path", "second_mode")]
+    monkeypatch.setattr(fitting.exchange, "_nothing", lambda result, name: False)
+    monkeypatch.setattr(fitting.search, "exchange", lambda *a: changed)
+    monkeypatch.setattr(fitting.search, "commuted", lambda *a: False)
+
+    def fit_on(current, fewer, target):
+        return fitted(1.04 if [e.name for e in fewer] == ["excess_loss", "second_eddy_path"] else 5.0, fewer)
+
+    state = Reached(ended, steps, {})
+    task = SimpleNamespace(say=lambda *a: None, fit_on=fit_on)
+    fitting.search._once_more(task, state, None, {}, (), lambda current: False)
+    assert [step[0].name for step in state.steps] == ["excess_loss", "second_eddy_path", "second_mode"][:number]
 
 
 @pytest.mark.parametrize(("left", "named"), [(1.05, ["transport_delay", "magnetic_aftereffect"]), (9.0, ["transport_delay", "creep"])])
@@ -1165,6 +1217,32 @@ def test_where_an_early_effect_is_exchanged_so_may_the_last_be(monkeypatch, chan
     assert found == asked
 
 
+@pytest.mark.parametrize(("far", "tried"), [("second_eddy_path", ["second_eddy_path"]), ("duffing_stiffness", [])])
+def test_known_likes_of_an_early_effect_are_tried_beside_the_later_one_however_far_they_ended_alone(monkeypatch, far, tried):
+    """A second path and an excess_loss: alone a field that diffuses took 309 to 4.5, and the path was given up at 248."""
+    best, rival = trial("field_diffusion", 4.5, base=309.0), trial(far, 248.0, base=309.0)
+    held = SimpleNamespace(effects=(SimpleNamespace(name="field_diffusion"),), without_effect=lambda name: held)
+
+    @dataclasses.dataclass
+    class Result:
+        chi2_per_sample: float
+        data_count: int = COUNT
+        choices: object = Choices()
+        actuator: object = dataclasses.field(default_factory=lambda: held)
+
+    steps = [(best, [best], [best, rival], Result(309.0)), (trial("excess_loss", 1.3, base=4.5), [], [], Result(4.5))]
+    asked = []
+
+    def fitted(task, rest, c, excess, target):
+        asked.append(c.name)
+        return dataclasses.replace(trial(c.name, 1.0, base=1.3), result=Result(1.0))
+
+    monkeypatch.setattr(fitting.exchange, "to_the_end", fitted)
+    state = Reached(Result(1.3), steps, {})
+    assert fitting.exchange._exchanged(Task((), None), state, 0) is bool(tried) and asked == tried
+    assert state.steps[0][0].name == (tried or ["field_diffusion"])[0]
+
+
 @pytest.mark.parametrize(("ends", "name"), [(1.2, "excess_loss"), (1.9, "rate_dependent_switching")], ids=["better", "worse"])
 def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, ends, name):
     best, rival, far = (
@@ -1193,6 +1271,90 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
     assert fitting.exchange._exchanged(Task((), None), state, 0) is (name == "excess_loss")
     assert tried == ["excess_loss"] and state.steps[0][0].name == name  # what takes far less is not tried
     assert state.current.chi2_per_sample == min(ends, 1.6)
+
+
+class Made:
+    """An actuator of effects that are physical but where their amplitude is below none."""
+
+    def __init__(self, *effects):
+        self.effects = effects
+
+    def effect(self, name):
+        return next(e for e in self.effects if e.name == name)
+
+    def without_effect(self, name):
+        return Made(*(e for e in self.effects if e.name != name))
+
+
+@pytest.mark.parametrize(
+    ("ends", "loss", "serves"), [(0.98, 1.0, True), (2.52, 1.0, False), (0.98, -1.0, False)], ids=["better", "no better", "unphysical itself"]
+)
+def test_what_a_rival_makes_unphysical_gives_way_to_its_like_beside_it(monkeypatch, ends, loss, serves):
+    """An excess_loss and a delay (0.7 %): beside a rate_dependent_switching a second_eddy_path took the misfit to 2.5; beside the excess_loss
+    it met the noise with a field that opposes more than the coil makes, as a lag does."""
+
+    @dataclasses.dataclass
+    class Result:
+        chi2_per_sample: float
+        actuator: object
+        data_count: int = COUNT
+        choices: object = Choices()
+
+    def made(**amplitudes):
+        return Made(*(CLASSES[n]().with_amplitude(a) for n, a in amplitudes.items()))
+
+    switching, rival, path = trial("rate_dependent_switching", 12.6, base=235.0), trial("excess_loss", 25.0, base=235.0), trial("second_eddy_path", 2.5, base=12.6)
+    mode, delay = trial("second_mode", 3.9, base=12.6), trial("transport_delay", 5.9, base=12.6)
+    current = Result(2.5, made(rate_dependent_switching=1.0, second_eddy_path=0.5))
+    steps = [(switching, [switching], [switching, rival], Result(235.0, None)), (path, [path], [path, mode, delay], Result(12.6, None))]
+    asked = []
+
+    def fitted(task, rest, c, excess, target):
+        beside = [e.name for e in rest.actuator.effects]
+        asked.append((beside, c.name))
+        if beside == ["second_eddy_path"]:
+            wrong = Result(0.97, made(second_eddy_path=-0.5, excess_loss=loss))
+            return dataclasses.replace(trial(c.name, 0.97, base=2.5), result=wrong, physical=False)
+        return dataclasses.replace(trial(c.name, ends, base=0.97), result=Result(ends, None), physical=c.name == "transport_delay")
+
+    monkeypatch.setattr(fitting.exchange, "to_the_end", fitted)
+    state = Reached(current, steps, {})
+    assert fitting.exchange._exchanged(Task((), None), state, 0) is serves
+    of_its_like = [] if loss < 0 else [(["excess_loss"], "transport_delay"), (["excess_loss"], "second_mode")]
+    assert asked == [(["second_eddy_path"], "excess_loss"), *of_its_like]
+    assert names([step[0] for step in state.steps]) == (["excess_loss", "transport_delay"] if serves else ["rate_dependent_switching", "second_eddy_path"])
+    assert state.current.chi2_per_sample == (ends if serves else 2.5) and (state.steps[1][0].result is state.current) is serves
+
+
+@pytest.mark.parametrize(("left", "another", "named"), [(2.5, True, "excess_loss"), (2.5, False, "creep"), (1.2, True, "creep")])
+def test_another_pair_is_asked_for_before_means_of_their_own(monkeypatch, left, another, named):
+    """Means of ten recordings took what a wrong pair left, and all began anew from there."""
+    base, asked = trial("none", 30.0).result, []
+    rounds = iter([[trial("creep", 12.0, base=30.0)], [trial("second_mode", left, base=12.0)], [trial("backlash", 0.99, base=1.0)]])
+
+    def exchange(task, state, check):
+        asked.append("exchange")
+        if another and state.current.chi2_per_sample == 2.5:
+            found = [trial(n, 1.1, base=30.0) for n in ("excess_loss", "transport_delay")]
+            state.steps, state.current = [(t, [t], [t], base) for t in found], found[1].result
+        return another
+
+    def means(fit, best, beside=()):
+        asked.append(fit.chi2_per_sample)
+        return False
+
+    monkeypatch.setattr(fitting.search, "exchange", exchange)
+    monkeypatch.setattr(fitting.search, "try_all", lambda *a: next(rounds))
+    monkeypatch.setattr(fitting.search, "_in_place_of_unphysical", lambda *a: [])
+    scores = iter([[candidate("second_mode", 90.0)], []])
+    monkeypatch.setattr(fitting.search, "screened", lambda result, choices: next(scores))
+    monkeypatch.setattr(fitting.search, "refitted", lambda task, now, best, good, *a: (best, good, task))
+    monkeypatch.setattr(fitting.search, "promises", lambda *a: True)
+    monkeypatch.setattr(fitting.search, "_once_more", lambda *a: None)
+    monkeypatch.setattr(fitting.search, "let_go", lambda *a: None)
+    found = fitting.search.search(Task((), load_bench("aa-050h")), base, [candidate("creep", 50.0)], free_means=means)
+    assert found.steps[0][0].name == named and len(found.steps) == 2
+    assert asked[1:] == {"excess_loss": ["exchange", 1.1], "creep": ["exchange", 2.5] if left > 2 else [1.2]}[named]
 
 
 @pytest.mark.parametrize("law", ["backlash", "accommodation"])
