@@ -16,6 +16,7 @@ from .spectra import evaluate_lines
 NEAR_ZERO = 0.3  # of the largest |M|, below which it may change sign
 TOUCHING = 0.03  # of the largest strain, below which it may be taken for none
 SIGNS = 50  # instants of a period at which the sign of M is sought
+DIPS = 0.1  # of the largest |M|, by which it must rise on both sides of where it is taken to pass through zero
 
 
 def operator_rows(basis, field: np.ndarray, history=()) -> np.ndarray:
@@ -61,8 +62,9 @@ def unreached_row(basis, highest, lowest, rest):
 def inferred_loops(spectra, deviations, actuator, samples: int = 200, touching: bool = False):
     """Field and magnetization over a period from the reading, by (4) and (5) backwards: lists of (H, M, trust).
 
-    `touching`: a strain that comes near zero is taken to reach it there, so that M may turn its sign: what keeps the rod from
-    coming back (friction, a strain that lags) hides that it does.
+    `touching`: a strain that comes near zero is taken to reach it there, so that M may turn its sign, and M to turn it wherever the strain
+    falls near zero and rises again on the way to a reversal of the drive: what keeps the rod from coming back (friction, a strain that
+    lags, damping) hides that it does.
     """
     loops, highest = [], max(np.abs(evaluate_lines(s.reading, np.arange(samples) / samples)).max() for s in spectra)
     phases = np.arange(samples) / samples
@@ -82,7 +84,7 @@ def inferred_loops(spectra, deviations, actuator, samples: int = 200, touching: 
             free = free - free.min() if touching and actuator.piezo is None and free.min() < TOUCHING * highest else free
             share, M_s = free / float(actuator.strained.reach), float(actuator.strained.M_s)
             even = actuator.piezo is None  # the strain of a rod hides the sign of M
-            M = M_s * (unfold(np.sqrt(np.maximum(share, 0.0)), applied) if even else share - _reversible(actuator, applied))
+            M = M_s * (unfold(np.sqrt(np.maximum(share, 0.0)), applied, touching) if even else share - _reversible(actuator, applied))
             rate = np.gradient(np.concatenate([M[-2:], M, M[:2]]))[2:-2] * samples * s.frequency
             H = applied - float(coil.loss) * MU0 * rate
             trust = np.abs(M) / max(np.abs(M).max(), 1e-300) if even else np.ones(samples)
@@ -102,11 +104,12 @@ def _reversible(actuator, voltage):
     return float(actuator.piezo.chi) / float(actuator.piezo.V_m) * voltage
 
 
-def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
+def unfold(root: np.ndarray, drive: np.ndarray, dips: bool = False) -> np.ndarray:
     """The signed M behind |M|, `root`, over a period of equidistant samples: where |M| nearly touches zero it may change sign.
 
     Of all signs the ones whose M bends least (a change of sign makes a corner of |M| a straight line), found by dynamic
-    programming over `SIGNS` instants, which average the noise; M is positive where the drive is largest.
+    programming over `SIGNS` instants, which average the noise; M is positive where the drive is largest. `dips`: it changes sign at every
+    dip, where these are even in number: between reversals of the drive M goes one way.
     """
     n, top = len(root), int(np.argmax(drive))
     count = min(SIGNS, n)
@@ -115,6 +118,8 @@ def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
     may = np.append(size, size[:2]) < NEAR_ZERO * size.max()
     if not may.any():
         return root
+    if dips and (turns := _dips(size)):
+        return _signed(root, size * np.where(np.searchsorted(turns, np.arange(count), "right") % 2, -1.0, 1.0), edges, top)
     closed = np.append(size, size[:2])
     signs = np.array([1.0, -1.0])
     cost = np.array([[0.0, np.inf], [np.inf, np.inf]])  # [sign before, sign now]; the first two are positive
@@ -129,9 +134,25 @@ def unfold(root: np.ndarray, drive: np.ndarray) -> np.ndarray:
     path = [0, 0]  # backwards from where it ends, as it began
     for back in came[::-1]:
         path.append(int(back[path[-1], path[-2]]))
-    signed = size * signs[path[::-1][:count]]
+    return _signed(root, size * signs[path[::-1][:count]], edges, top)
+
+
+def _dips(size) -> list[int]:
+    """Where |M|, over a period from its largest on, comes near zero between lobes; [] where these are not even in number."""
+    near = np.flatnonzero((size <= np.roll(size, 1)) & (size < np.roll(size, -1)) & (size < NEAR_ZERO * size.max()))
+    found: list[int] = []
+    for k in near.tolist():
+        if not found or size[found[-1] : k].max() > max(size[found[-1]], size[k]) + DIPS * size.max():
+            found.append(k)
+        elif size[k] < size[found[-1]]:  # no lobe between the two: the deeper one
+            found[-1] = k
+    return found if len(found) % 2 == 0 else []
+
+
+def _signed(root, signed, edges, top):
+    """`root`, over a period of equidistant samples, with the signs of some averages of it between `edges`, counted from `top` on."""
     middles = 0.5 * (edges[:-1] + edges[1:] - 1)
-    found = np.interp(np.arange(n), middles, signed, period=n)
+    found = np.interp(np.arange(len(root)), middles, signed, period=len(root))
     return root * np.roll(np.where(found < 0, -1.0, 1.0), top)
 
 

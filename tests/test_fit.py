@@ -629,6 +629,22 @@ def test_unfold_sees_through_noise(offset):
         assert np.sqrt(np.mean((found - M * np.sign(M[np.argmax(drive)])) ** 2)) < 0.1
 
 
+@pytest.mark.parametrize(("lowest", "smoothing", "turns"), [(-0.4, 4, True), (-0.4, 5, True), (0.1, 4, False), (-0.1, 8, False)],
+                         ids=["lobe", "blurred lobe", "one sign", "hardly a lobe"])  # fmt: skip
+def test_dips_tell_the_sign_that_damping_blurs(lowest, smoothing, turns):
+    """A structural_damping of 3.8 %: |M| fell to 0.22 and 0.16 of its largest where it passed through zero, with a lobe of 0.43 between."""
+    turn = np.arange(200) / 200
+    drive = np.cos(2 * np.pi * turn)
+    M = lowest + (1 - lowest) / 2 * (1 + np.tanh(6 * np.cos(2 * np.pi * (turn - 0.04))))  # from `lowest` to 1, steep
+    lines = np.fft.rfft(M**2) * np.exp(-0.5 * (np.arange(101) / (60 / smoothing)) ** 2)
+    root = np.sqrt(np.maximum(np.fft.irfft(lines, 200), 0.0))
+    found = unfold(root, drive, dips=True)
+    assert bool((found < 0).any()) is turns and np.abs(found) == pytest.approx(root)
+    if turns:
+        assert not (unfold(root, drive) < 0).any()
+        assert np.mean((found < 0) == (M < 0)) > 0.95
+
+
 def test_a_reading_that_is_negative_throughout_starts_without_a_warning(recordings, bench):
     """No strain of the rod is negative: there is no M behind it, and nothing to scale by."""
     turned = [dataclasses.replace(r, channels={**r.channels, "displacement": -r.channels["displacement"]}) for r in recordings]
