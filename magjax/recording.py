@@ -261,15 +261,15 @@ def _closes(x) -> bool:
 
 
 def _better(x, dt, found):
-    """The shortest period that the whole record holds some of, longer than that of `found`, Hz, where its harmonics leave far less of x;
-    else `found`."""
+    """The shortest period, longer than that of `found`, Hz, of which the record holds one, two or three (more of them show in its
+    autocorrelation), where its harmonics leave far less of x; else `found`."""
     whole = 1.0 / (len(x) * dt)
 
     def left(f):
         return _leftover(x, dt, f)(f) + 1e-12 * float(x @ x)
 
     most = 0.3 * left(found)
-    return next((k * whole for k in range(max(1, int(found / whole / 1.5)), 0, -1) if left(k * whole) <= most), found)
+    return next((k * whole for k in range(int(np.clip(found / whole / 1.5, 1, 3)), 0, -1) if left(k * whole) <= most), found)
 
 
 def _leftover(x, dt, f, most: int = 5):
