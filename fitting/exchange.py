@@ -120,14 +120,8 @@ def _exchanged(task, state, index, check=()) -> bool:
     cost = best.parameters * np.log(rest.data_count)
     trials = [Trial(best.candidate, state.current, 0.0, cost, True, best.explained_share, best.parameters)]
     near = sorted(near, key=lambda t: t.bic_change)[:MOST_RIVALS]
-
     near_enough = (1 + MISFIT_TIE) * chi2_of(state.current) + 2 * WEAK_TIE[1]  # beyond it none is a rival
-
-    def beside(t):
-        return lambda say: to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP, near_enough)
-
-    for t, trial in zip(near, together([beside(t) for t in near], task.progress), strict=True):
-        trials.append(dataclasses.replace(trial, explained_share=t.explained_share))  # its share is that of its own round
+    trials += _beside(task, rest, near, near_enough)
     wrong = min((t for t in trials if not t.physical), key=lambda t: t.bic_change, default=None)
     trials = [t for t in trials + fresh if t.physical]
     found = min(trials, key=lambda t: t.bic_change)
@@ -136,6 +130,16 @@ def _exchanged(task, state, index, check=()) -> bool:
     if len(state.steps) == 2 and wrong is not None and wrong.bic_change < found.bic_change - BIC_DROP:
         return _beside_unphysical(task, state, index, wrong) or found.name != best.name
     return found.name != best.name
+
+
+def _beside(task, rest, rivals, target) -> list[Trial]:
+    """Trials of `rivals`, each fitted beside the effects of `rest` alone; the share of the misfit that each takes is that of its own round."""
+
+    def fitted(t):
+        return lambda say: to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP, target)
+
+    ended = together([fitted(t) for t in rivals], task.progress)
+    return [dataclasses.replace(trial, explained_share=t.explained_share) for t, trial in zip(rivals, ended, strict=True)]
 
 
 def _beside_unphysical(task, state, index, wrong) -> bool:
@@ -149,15 +153,12 @@ def _beside_unphysical(task, state, index, wrong) -> bool:
     rest = dataclasses.replace(wrong.result, actuator=wrong.result.actuator.without_effect(other.name))
     like = COMPANIONS.get(other.name, ())
     seconds = sorted((t for t in seconds if t.name not in (other.name, wrong.name)), key=lambda t: (t.name not in like, t.bic_change))
-
-    def beside(t):
-        return lambda say: to_the_end(task.on(progress=say), rest, t.candidate, MIN_DROP, chi2_of(state.current))
-
-    tried = together([beside(t) for t in seconds[:MOST_RIVALS]], task.progress)
-    tried = [dataclasses.replace(trial, explained_share=t.explained_share) for t, trial in zip(seconds, tried, strict=False) if trial.physical]
-    found, of_one = min(tried, key=lambda t: t.bic_change, default=None), np.log(state.current.data_count)
-    more = 0 if found is None else wrong.parameters + found.parameters - best.parameters - other.parameters
-    if found is None or chi2_of(found.result) + more * of_one > chi2_of(state.current) - BIC_DROP:
+    tried = [t for t in _beside(task, rest, seconds[:MOST_RIVALS], chi2_of(state.current)) if t.physical]
+    if not tried:
+        return False
+    found = min(tried, key=lambda t: t.bic_change)
+    more = (wrong.parameters + found.parameters - best.parameters - other.parameters) * np.log(state.current.data_count)
+    if chi2_of(found.result) + more > chi2_of(state.current) - BIC_DROP:
         return False
     own = dataclasses.replace(wrong, result=found.result, physical=True, explained_share=best.explained_share)
     state.steps[index] = (own, [own], [own, *(t for t in good if t.name != own.name)], previous)

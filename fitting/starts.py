@@ -109,7 +109,7 @@ def unfold(root: np.ndarray, drive: np.ndarray, dips: bool = False) -> np.ndarra
 
     Of all signs the ones whose M bends least (a change of sign makes a corner of |M| a straight line), found by dynamic
     programming over `SIGNS` instants, which average the noise; M is positive where the drive is largest. `dips`: it changes sign at every
-    dip, where these are even in number: between reversals of the drive M goes one way.
+    dip, where a lower drive lies between the two of each pair: between reversals of the drive M goes one way.
     """
     n, top = len(root), int(np.argmax(drive))
     count = min(SIGNS, n)
@@ -118,7 +118,7 @@ def unfold(root: np.ndarray, drive: np.ndarray, dips: bool = False) -> np.ndarra
     may = np.append(size, size[:2]) < NEAR_ZERO * size.max()
     if not may.any():
         return root
-    if dips and (turns := _dips(size)):
+    if dips and (turns := _dips(size, np.add.reduceat(np.roll(drive, -top), edges[:-1]) / np.diff(edges))):
         return _signed(root, size * np.where(np.searchsorted(turns, np.arange(count), "right") % 2, -1.0, 1.0), edges, top)
     closed = np.append(size, size[:2])
     signs = np.array([1.0, -1.0])
@@ -137,8 +137,9 @@ def unfold(root: np.ndarray, drive: np.ndarray, dips: bool = False) -> np.ndarra
     return _signed(root, size * signs[path[::-1][:count]], edges, top)
 
 
-def _dips(size) -> list[int]:
-    """Where |M|, over a period from its largest on, comes near zero between lobes; [] where these are not even in number."""
+def _dips(size, drive) -> list[int]:
+    """Where |M| comes near zero between lobes, over a period from the largest drive on; [] where these are not pairs with a lower drive
+    between the two."""
     near = np.flatnonzero((size <= np.roll(size, 1)) & (size < np.roll(size, -1)) & (size < NEAR_ZERO * size.max()))
     found: list[int] = []
     for k in near.tolist():
@@ -146,7 +147,9 @@ def _dips(size) -> list[int]:
             found.append(k)
         elif size[k] < size[found[-1]]:  # no lobe between the two: the deeper one
             found[-1] = k
-    return found if len(found) % 2 == 0 else []
+    pairs = zip(found[::2], found[1::2], strict=False)
+    lower = all(drive[a + 1 : b].mean() < 0.5 * (drive[a] + drive[b]) for a, b in pairs)  # there is a lobe between the two
+    return found if lower and len(found) % 2 == 0 else []
 
 
 def _signed(root, signed, edges, top):

@@ -178,9 +178,6 @@ def follows_nothing(recording: Recording, channel: str) -> bool:
     return shared < (1 + 6 * np.sqrt(2 / blocks.shape[1])) * noise / len(blocks)
 
 
-UNLIKE = 2e-3  # of a drive's power, by which its periods may differ: where they do by more, they may be parts of longer ones, as of two tones of like pitch
-
-
 def refuse_constant(name: str, channel: str, values: np.ndarray):
     """Raise `RecordingError` where a channel, (time,), never changes."""
     if np.ptp(values) == 0:
@@ -214,6 +211,9 @@ def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
     # a longer period must show in the signal, as a modulation does; a shorter one must leave no more of it
     agrees = abs(refined - found) * n * dt < 0.5
     return refined if agrees or left < 0.3 * left_else or (refined > found and left < 1.2 * left_else) else found
+
+
+UNLIKE = 2e-3  # of a drive's power, by which its periods may differ: where they do by more, they may be parts of longer ones, as of two tones of like pitch
 
 
 def _repetition(x, dt):

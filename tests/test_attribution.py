@@ -1217,19 +1217,34 @@ def test_where_an_early_effect_is_exchanged_so_may_the_last_be(monkeypatch, chan
     assert found == asked
 
 
+class Made:
+    """An actuator of effects that are physical but where their amplitude is below none."""
+
+    def __init__(self, *effects):
+        self.effects = effects
+
+    def effect(self, name):
+        return next(e for e in self.effects if e.name == name)
+
+    def without_effect(self, name):
+        return Made(*(e for e in self.effects if e.name != name))
+
+
+@dataclasses.dataclass
+class Result:
+    """A fit as an exchange asks it."""
+
+    chi2_per_sample: float
+    actuator: object = None
+    data_count: int = COUNT
+    choices: object = Choices()
+
+
 @pytest.mark.parametrize(("far", "tried"), [("second_eddy_path", ["second_eddy_path"]), ("duffing_stiffness", [])])
 def test_known_likes_of_an_early_effect_are_tried_beside_the_later_one_however_far_they_ended_alone(monkeypatch, far, tried):
     """A second path and an excess_loss: alone a field that diffuses took 309 to 4.5, and the path was given up at 248."""
     best, rival = trial("field_diffusion", 4.5, base=309.0), trial(far, 248.0, base=309.0)
-    held = SimpleNamespace(effects=(SimpleNamespace(name="field_diffusion"),), without_effect=lambda name: held)
-
-    @dataclasses.dataclass
-    class Result:
-        chi2_per_sample: float
-        data_count: int = COUNT
-        choices: object = Choices()
-        actuator: object = dataclasses.field(default_factory=lambda: held)
-
+    held = Made(SimpleNamespace(name="field_diffusion"))
     steps = [(best, [best], [best, rival], Result(309.0)), (trial("excess_loss", 1.3, base=4.5), [], [], Result(4.5))]
     asked = []
 
@@ -1238,7 +1253,7 @@ def test_known_likes_of_an_early_effect_are_tried_beside_the_later_one_however_f
         return dataclasses.replace(trial(c.name, 1.0, base=1.3), result=Result(1.0))
 
     monkeypatch.setattr(fitting.exchange, "to_the_end", fitted)
-    state = Reached(Result(1.3), steps, {})
+    state = Reached(Result(1.3, held), steps, {})
     assert fitting.exchange._exchanged(Task((), None), state, 0) is bool(tried) and asked == tried
     assert state.steps[0][0].name == (tried or ["field_diffusion"])[0]
 
@@ -1248,16 +1263,8 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
     best, rival, far = (
         trial(n, x, base=150.0) for n, x in (("rate_dependent_switching", 20.0), ("excess_loss", 45.0), ("creep", 99.0))
     )
-    held = SimpleNamespace(effects=(SimpleNamespace(name="rate_dependent_switching"),), without_effect=lambda name: held)
-
-    @dataclasses.dataclass
-    class Result:
-        chi2_per_sample: float
-        data_count: int = COUNT
-        choices: object = Choices()
-        actuator: object = dataclasses.field(default_factory=lambda: held)
-
-    current = Result(1.6)
+    held = Made(SimpleNamespace(name="rate_dependent_switching"))
+    current = Result(1.6, held)
     steps = [(best, [best], [best, rival, far], Result(150.0)), (trial("sensor_lag", 1.6, base=20.0), [], [], Result(20.0))]
     tried = []
 
@@ -1273,32 +1280,12 @@ def test_a_rival_of_an_early_effect_is_tried_beside_the_later_one(monkeypatch, e
     assert state.current.chi2_per_sample == min(ends, 1.6)
 
 
-class Made:
-    """An actuator of effects that are physical but where their amplitude is below none."""
-
-    def __init__(self, *effects):
-        self.effects = effects
-
-    def effect(self, name):
-        return next(e for e in self.effects if e.name == name)
-
-    def without_effect(self, name):
-        return Made(*(e for e in self.effects if e.name != name))
-
-
 @pytest.mark.parametrize(
     ("ends", "loss", "serves"), [(0.98, 1.0, True), (2.52, 1.0, False), (0.98, -1.0, False)], ids=["better", "no better", "unphysical itself"]
 )
 def test_what_a_rival_makes_unphysical_gives_way_to_its_like_beside_it(monkeypatch, ends, loss, serves):
     """An excess_loss and a delay (0.7 %): beside a rate_dependent_switching a second_eddy_path took the misfit to 2.5; beside the excess_loss
     it met the noise with a field that opposes more than the coil makes, as a lag does."""
-
-    @dataclasses.dataclass
-    class Result:
-        chi2_per_sample: float
-        actuator: object
-        data_count: int = COUNT
-        choices: object = Choices()
 
     def made(**amplitudes):
         return Made(*(CLASSES[n]().with_amplitude(a) for n, a in amplitudes.items()))

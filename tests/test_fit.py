@@ -645,6 +645,12 @@ def test_dips_tell_the_sign_that_damping_blurs(lowest, smoothing, turns):
         assert np.mean((found < 0) == (M < 0)) > 0.95
 
 
+def test_a_drive_that_turns_twice_above_zero_has_no_lobe_between_its_dips():
+    turn = np.arange(200) / 200
+    M = 0.6 + 0.5 * np.cos(4 * np.pi * turn) + 0.05 * np.cos(2 * np.pi * turn)
+    assert (unfold(M, np.cos(4 * np.pi * turn) + 0.1 * np.cos(2 * np.pi * turn), dips=True) > 0).all()
+
+
 def test_a_reading_that_is_negative_throughout_starts_without_a_warning(recordings, bench):
     """No strain of the rod is negative: there is no M behind it, and nothing to scale by."""
     turned = [dataclasses.replace(r, channels={**r.channels, "displacement": -r.channels["displacement"]}) for r in recordings]
