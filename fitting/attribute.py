@@ -24,6 +24,7 @@ CLOSE = 0.8  # share of the best score that makes a close rival
 MIN_DROP = 25.0  # chi2; five standard deviations, beyond the placebo
 BIC_DROP = 10.0
 TIE = 9.0  # BIC; rivals nearer than this to the best are not told apart
+NOTHING = 2.0  # standard errors within which an amplitude is none
 FORM_ERROR = 0.005  # of what the effects found take: as little as that is left by their laws' form, and names nothing further
 WEAK_TIE = (0.2, 25.0)  # nor rivals that meet the noise themselves within this share of the best's fall, up to so much or that form of the others
 UNCONFIRMED_TIE = (0.3, 50.0)  # the same where check recordings are missed as far with the best as without
@@ -228,6 +229,13 @@ def is_physical(effect) -> bool:
     info, amplitude = effect.parameters()[effect.amplitude], float(getattr(effect, effect.amplitude))
     largest = OUT_OF_REACH * max(map(abs, info.typical)) if info.typical and np.isinf(info.high) else np.inf
     return (info.low < 0 or amplitude >= 0) and abs(amplitude) <= largest and effect.is_itself()
+
+
+def is_nothing(result, name) -> bool:
+    """Whether the amplitude of an effect of a fit is within its errors of none."""
+    effect = result.actuator.effect(name)
+    found = result.estimate(f"effects.{name}.{effect.amplitude}")
+    return abs(found.value - effect.parameters()[effect.amplitude].null) < NOTHING * (found.stderr or 0.0)
 
 
 def rivals_of(best: Trial, trials, near=WEAK_TIE, others: float = 0.0) -> list[Trial]:

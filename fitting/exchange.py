@@ -22,6 +22,7 @@ from .attribute import (
     chi2_of,
     credited,
     excess_of,
+    is_nothing,
     is_physical,
     leaders,
     rivals_of,
@@ -38,7 +39,6 @@ from .verdict import HALF, NULL_CHI2
 NEAR_RIVAL, MOST_RIVALS = 0.3, 4  # share of what an early effect left, within which rivals are tried beside later ones; how many
 NEAR_SHARE = 0.25  # of an early effect's fall, within which too
 PROMISED_ANEW = 0.8  # of what an effect has brought beside the others, that another must promise there to be tried
-NOTHING = 2.0  # standard errors within which an amplitude is none
 
 
 def backward(task, state, made_up=None, last_too: bool = False):
@@ -56,7 +56,7 @@ def backward(task, state, made_up=None, last_too: bool = False):
         if name not in {e.name for e in actuator.effects}:
             continue
         last = step is state.steps[-1] and not state.form
-        if last and (len(state.steps) == 1 or not (last_too or _nothing(state.current, name))):
+        if last and (len(state.steps) == 1 or not (last_too or is_nothing(state.current, name))):
             continue
         task.say(f"without {name}", state.current.chi2_per_sample)
         form = FORM_ERROR * (chi2_of(state.steps[0][3]) - chi2_of(state.current))
@@ -80,13 +80,6 @@ def _in_its_place(step, candidate, result, others):
     found = credited(candidate, result, previous, effect, max(excess_of(previous), MIN_DROP))
     trials = [found, *(t for t in good if t.name != candidate.name)]
     return found, rivals_of(found, trials, others=others), trials, previous
-
-
-def _nothing(result, name) -> bool:
-    """Whether an effect's amplitude is within its errors of none."""
-    effect = result.actuator.effect(name)
-    found = result.estimate(f"effects.{name}.{effect.amplitude}")
-    return abs(found.value - effect.parameters()[effect.amplitude].null) < NOTHING * (found.stderr or 0.0)
 
 
 def exchange(task, state, check=()) -> bool:

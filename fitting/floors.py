@@ -18,6 +18,8 @@ SWAPPED, ONE_SWAPPED = 20.0, 1e4  # chi2/N from which a sign may be swapped: in 
 MOST = 0.8  # share of the recordings that must show it
 RESTLESS = 5.0  # mean square of the first period between its harmonics over the white noise
 COARSE = 20  # samples a period, below which harmonics fall between those that are read
+FALLS = 1.5  # mean square of what two periods differ by, first half over second, from which it decays within two periods or so
+HALF_OF_IT, SIDEBANDS, LASTS = 0.5, 2.5, 2.0  # of what does not repeat, a tone with its sidebands (orders); its first third over its last
 NO_DRIFT = 0.25  # share of the change from the first period to the last that a drift must leave for a transient
 
 
@@ -51,9 +53,9 @@ def _unsettled(recordings, spectra, output) -> str | None:
             blocks = _by_period(s, y)
             floor = np.sqrt(2 * s.noise.white)
             first, later = _changes(blocks)
-            sudden = first > 0.03 * s.peak_to_peak and first > 8 * floor and first > 4 * later
+            sudden = first > 0.03 * s.peak_to_peak and first > 8 * floor and (first > 4 * later if s.periods > 2 else _falls(blocks))
             if sudden and _changes(_by_period(s, y - drift_of(s)[1]))[0] > NO_DRIFT * first:
-                return (
+                return _tone_beside(recording.name, s, y, unit) or (
                     f"{recording.name}: the first period differs from the last by {sized(unit, first)} rms and later ones do not: an unsettled "
                     "transient; cut the first periods or wait before recording"
                 )
@@ -63,7 +65,7 @@ def _unsettled(recordings, spectra, output) -> str | None:
     recording, s = min(zip(recordings, spectra, strict=True), key=lambda pair: pair[1].samples * pair[1].dt)
     y = _reading(recording, s, output) - drift_of(s)[1]
     if s.periods >= 2 and (change := _changes(_by_period(s, y))[0]) > max(0.01 * s.peak_to_peak, 8 * np.sqrt(2 * s.noise.white)):
-        return (
+        return _tone_beside(recording.name, s, y, unit) or (
             f"{recording.name}: the periods do not repeat: the last differs from the first by {sized(unit, change)} rms within "
             f"{s.samples * s.dt * 1e3:.3g} ms, and no drift explains it; wait until the reading is settled, then record"
         )
@@ -110,6 +112,29 @@ def _changes(blocks):
     """Rms of the last period less the first, and less the one before it."""
     first = float(np.sqrt(np.mean((blocks[0] - blocks[-1]) ** 2)))
     return first, float(np.sqrt(np.mean((blocks[-2] - blocks[-1]) ** 2))) if len(blocks) > 2 else 0.0
+
+
+def _tone_beside(name, s, y, unit) -> str | None:
+    """That a tone which lasts stands between the harmonics, in words; None where that is not most of what does not repeat. Its
+    sidebands within two of the drive's lines count with it: it may come and go with the stroke."""
+    left = _by_period(s, y).ravel()
+    power = np.abs(np.fft.rfft(left * np.hanning(len(left)))) ** 2
+    order = np.arange(len(power)) / s.periods
+    highest = order[np.argmax(power)]
+    thirds = [np.mean(part**2) for part in np.array_split(left, 3)]
+    if power[np.abs(order - highest) <= SIDEBANDS].sum() < HALF_OF_IT * power.sum() or thirds[0] > LASTS * thirds[2] or highest < SIDEBANDS:
+        return None
+    return (
+        f"{name}: a tone near {highest * s.frequency:.4g} Hz that is no harmonic of the drive lasts through the record, "
+        f"{sized(unit, float(np.std(left)))} rms: an interference, or a carrier folded down by the sampling; filter it out before the converter, "
+        "or sample at another rate"
+    )
+
+
+def _falls(blocks) -> bool:
+    """Whether what two periods differ by falls, as a transient does; a tone beside the drive's harmonics lasts."""
+    halves = np.array_split((blocks[0] - blocks[1]) ** 2, 2)
+    return bool(halves[0].mean() > FALLS * halves[1].mean())
 
 
 def swapped(spectra, fits=()) -> str | None:

@@ -3,10 +3,10 @@
 import dataclasses
 import functools
 
-from .attribute import LIKE_DENSITY, MIN_DROP, chi2_of, excess_of
+from .attribute import LIKE_DENSITY, MIN_DROP, chi2_of, excess_of, is_nothing
 from .finer import FINER_FROM, FINEST_BELOW, REFINE_BELOW, finer_hats, finest, hats_of_step
 from .screen import screened
-from .verdict import HALF, Z_THRESHOLD
+from .verdict import FAR_FROM_NOISE, HALF, Z_THRESHOLD
 
 UNPROMISED = 3.0  # times what any effect promised, that effects take where the plain fit is tried from where they led
 VALLEY = 0.3  # of what they take, that the plain fit must fall by from there
@@ -19,10 +19,13 @@ UNEXPLAINED = 60.0  # chi2/N below which a finer density is tried where no candi
 
 def better_valley(task, plain, candidates, current):
     """The plain fit from where that with effects ended, if it falls far: it had settled in a valley of its density, and an effect
-    was credited with the way out. Asked where the effects take far more than any promised to first order. None elsewhere.
+    was credited with the way out. Asked where the effects take far more than any promised to first order, where one of them is
+    within its errors of none, and where so little was left that any small change may lead out. None elsewhere.
     """
     drop = chi2_of(plain) - chi2_of(current)
-    if drop < UNPROMISED * max(c.z**2 for c in candidates):
+    names = {e.name for e in current.actuator.effects} - {e.name for e in plain.actuator.effects}
+    kept = drop < UNPROMISED * max(c.z**2 for c in candidates) and plain.chi2_per_sample > FAR_FROM_NOISE
+    if kept and not any(is_nothing(current, n) for n in names):
         return None
     task.say("the plain model from there", current.chi2_per_sample)
     better = task.fit_on(current, _without_found(current, plain), choices=current.choices)

@@ -13,6 +13,7 @@ from .attribute import (
     BIC_DROP,
     FEEDBACKS,
     FORM_ERROR,
+    LAGS,
     MIN_DROP,
     MISFIT,
     chi2_of,
@@ -265,10 +266,18 @@ def _takes_too_little(state, best, excess) -> bool:
 
 
 def _makes_up_for_form(state, base, best) -> bool:
-    """Whether a further effect takes as little as the form of the laws of those found leaves."""
+    """Whether a further effect takes as little as the form of the laws of those found leaves, or takes back part of a lag."""
+    if _takes_back(state, best):
+        return True
     half = best.result.chi2_per_sample < MISFIT or best.explained_share > HALF
     least = FORM_ERROR if half else OF_FORM
     return best.drop < least * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best)
+
+
+def _takes_back(state, best) -> bool:
+    """Whether a further effect is a delay below none beside a lag that was found: together they are one lag of another form."""
+    late = {e.name: float(getattr(e, e.amplitude)) for e in best.result.actuator.effects if e.name in LAGS}
+    return best.name in late and any(step[0].name in late for step in state.steps) and min(late.values()) < 0
 
 
 def _not_confirmed(state, best, excess, check) -> bool:

@@ -17,9 +17,8 @@ from jaxtyping import Array
 from scipy.linalg import cho_factor, cho_solve
 
 CHUNK = 40
-CURVED = 0.5  # of the promised fall; a step that brings less is bent along the valley
+CURVED = -2.0, 0.5  # of the promised fall, between which a step is led back into the valley; what rises by more, that seldom saves
 LOADS = tuple(10.0**-k for k in range(2, 10))  # on a diagonal of ones
-BEND = 0.2  # of the step, over which its curvature is taken
 
 
 class ProjectedState(eqx.Module):
@@ -115,7 +114,7 @@ class SteppedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     the unknowns, are compiled programs, and there is nothing else to compile.
 
     `options["prior"]`: the curvature of a quadratic prior, which adds y'Py / 2 to half the sum of squares. A step whose fall
-    is far from what it promised is bent along the valley. For `optimistix.least_squares`, which traces the step, take
+    is far from what it promised is led back into the valley. For `optimistix.least_squares`, which traces the step, take
     `ProjectedLevenbergMarquardt`.
     """
 
@@ -144,12 +143,13 @@ class SteppedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             new_cost = cost_of(trial, new, prior)
             ratio = (cost - new_cost) / float(predicted) if float(predicted) > 1e-12 * cost else -1.0
             reached = new
-            if ratio < CURVED and float(predicted) > 1e-4 * cost + 1:
-                bent = bent_step(lambda z: fn(z, args)[0], self.bounds, y, new, residual, J, normal, damping)
-                other = fn(bent, args)[0]
-                other_cost = cost_of(other, bent, prior)
+            if CURVED[0] < ratio < CURVED[1] and float(predicted) > 1e-4 * cost + 1:
+                curved = J.T @ trial + prior @ new - gradient - normal @ (new - y)
+                back = led_back(normal, curved, new, damping, self.bounds)
+                other = fn(back, args)[0]
+                other_cost = cost_of(other, back, prior)
                 if not other_cost >= new_cost:
-                    reached, trial, new_cost, ratio = bent, other, other_cost, (cost - other_cost) / float(predicted)
+                    reached, trial, new_cost, ratio = back, other, other_cost, (cost - other_cost) / float(predicted)
             good = bool(np.isfinite(new_cost) and ratio > 1e-3)
             damping = max(damping * (0.15 if ratio > 0.5 else 1.0 if good else 6.0), 1e-9)
             if good or float(predicted) < 1e-6 * cost + 1e-3:
@@ -173,17 +173,17 @@ def cost_of(residual, y, prior) -> float:
         return 0.5 * float(residual @ residual + y @ prior @ y)
 
 
-def bent_step(residual_at, bounds, y, new, residual, J, normal, damping):
-    """The step from y to `new`, bent as the valley is: geodesic acceleration (Transtrum, Sethna 2012), central differences."""
-    delta = new - y
-    curvature = (residual_at(y + BEND * delta) - 2 * residual + residual_at(y - BEND * delta)) / BEND**2
+def led_back(normal, curved, new, damping, bounds):
+    """From the end `new` of a step back towards the valley that it left (geodesic acceleration; Transtrum, Sethna 2012). `curved`:
+    the gradient there less what it would be along straight lines, by the Jacobian of where the step began: to second order that
+    needs no further march. What the step has put at a bound stays there."""
     lower, upper = bounds
     free = np.flatnonzero((new > lower) & (new < upper))
     scale = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
     matrix = normal[np.ix_(free, free)] * scale[:, None] * scale + damping * np.eye(len(free))
-    bent = new.copy()
-    bent[free] -= 0.5 * scale * np.linalg.solve(matrix + 1e-12 * np.eye(len(free)), scale * (J[:, free].T @ curvature))
-    return np.clip(bent, lower, upper)
+    back = new.copy()
+    back[free] -= scale * np.linalg.solve(matrix + 1e-12 * np.eye(len(free)), scale * curved[free])
+    return np.clip(back, lower, upper)
 
 
 def damped_step(normal, gradient, y, damping, bounds, near=None):

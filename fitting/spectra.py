@@ -10,6 +10,8 @@ import dataclasses
 import numpy as np
 from scipy.optimize import minimize
 
+from magjax.recording import whole_periods
+
 HARMONICS = 40
 ON_LINE = 0.6  # of the spacing that a record resolves, within which a tone stands on a line
 DRIFT_ZERO = 0.25  # of a drift's size: where it had begun is not known
@@ -98,7 +100,7 @@ def reduce_recording(recording, drive: str, output: str, harmonics: int = HARMON
     dt, frequency = float(recording.dt), float(recording.frequency())
     x, y = (np.asarray(recording.channels[c], float) for c in (drive, output))
     per_period = 1.0 / (frequency * dt)
-    periods = max(1, int(np.floor(len(x) / per_period + 1e-6)))
+    periods = max(1, whole_periods(len(x), per_period))
     samples = min(len(x), int(round(periods * per_period)))
     x, y = x[:samples], y[:samples]
     # phases that close exactly where the samples do

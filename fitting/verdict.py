@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.words import sized
 
-from .attribute import LIKE_DENSITY, MIN_DROP, MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
+from .attribute import LAGS, LIKE_DENSITY, MIN_DROP, MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
 from .check import check_errors, foretold_text
 from .diagnosis import Diagnosis, Evidence, least_excess, misfit
 from .experiments import INSTRUMENTS, instrument_request
@@ -42,6 +42,7 @@ SETTLES = 50.0, 1.1  # chi2/N of a misfit and of all others' fits, and what one 
 SAYS_FOR = 10.0  # what these then say for a repair, as a fall of chi2, though their errors rise
 EXPECTED, AGAINST = 1.5, 0.1  # chi2 per number in these units, up to which a repair errs as it expects; share of its fall that they may speak against it
 FORM_TEXT = " The model makes up for the form of its law by {}, which takes too little beside it to be named."
+TAKEN_BACK_TEXT = " The model makes up for the form of the lag by a transport_delay below none: the two are one lag of another shape, late by {} in all."
 CREEPS_TEXT = " The slow drift within the records, which was taken out of them, is the {} going on."
 BEHIND_TEXT = " The mean levels, which take no part in the fit, are as far as the {} had come in each recording."
 ZEROS_TEXT = " The reading's level changes from recording to recording by {} (rms) more than the model's; the means take no part in the fit."
@@ -137,7 +138,7 @@ def verdict(evidence: Evidence, rough: bool = False) -> Diagnosis:
         found = _grouped(evidence, common | {"rivals": sizes, "ties": ties_of(evidence)}, effects, groups, rivals, swap, asked)
     else:
         found = _attributed(evidence, common, effects, swap, asked)
-    form = FORM_TEXT.format(evidence.reached.form) if evidence.reached.form else ""
+    form = _form(evidence.reached)
     for effect, _ in evidence.adopted:
         if effect.shapes.get("zeros"):
             slow = behind(effect, evidence)
@@ -256,6 +257,16 @@ def followed(evidence, first, after: float) -> bool:
         return False
     rows = check_errors(evidence.raw.actuator, first.reached.current.actuator, raw, evidence.bench, clean)
     return bool(after < FOLLOWS[1] * misfit(rows, "rms_after"))
+
+
+def _form(reached) -> str:
+    """What is said of an effect that makes up for the form of the others' laws, "" where there is none."""
+    if not reached.form:
+        return ""
+    late = {e.name: float(getattr(e, e.amplitude)) for e in reached.current.actuator.effects if e.name in LAGS}
+    if reached.form in late and len(late) > 1 and min(late.values()) < 0:
+        return TAKEN_BACK_TEXT.format(sized("s", sum(late.values())))
+    return FORM_TEXT.format(reached.form)
 
 
 def unconfirmed(reached):

@@ -7,7 +7,7 @@ are there; so periods need not divide the sampling, and a gap needs no interpola
 import numpy as np
 
 from .errors import RecordingError
-from .recording import fundamental
+from .recording import fundamental, whole_periods
 
 MOST_HARMONICS = 40
 MOST_MISSING = 0.1  # of the samples
@@ -94,7 +94,7 @@ def without_strays(time, channels, drive):
     mended, counts = {**channels, drive: _by_neighbours(channels[drive])}, {}
     for _ in range(2):  # a stray of the drive moves its period, and with it all others
         f = fundamental(np.interp(full, index, mended[drive]), dt)
-        if f is None or len(full) * dt * f < 3 - 1e-6:
+        if f is None or whole_periods(len(full), 1 / (f * dt)) < 3:
             return channels, {}
         phases = f * dt * index
         design = _design(phases, _orders(phases, 1 / (f * dt)))

@@ -137,8 +137,8 @@ class Recording:
         values, per = np.asarray(self.channels[channel], float), self.period_samples()
         if per is None:
             return np.zeros((0, 0))
-        count, width = int(np.floor(len(values) / per + 1e-6)), int(round(per))
-        if abs(per - width) * count < 1e-3:
+        count, width = whole_periods(len(values), per), int(round(per))
+        if abs(per - width) * count < 1e-3 and len(values) >= count * width:
             return values[: count * width].reshape(count, width)
         from scipy.interpolate import CubicSpline
 
@@ -154,7 +154,14 @@ class Recording:
 
     def noise_is_a_guess(self, channel: str) -> bool:
         """Whether nothing tells the noise of a channel: less than two whole periods, and no rms in `noise`."""
-        return not self.noise.get(channel) and self.periods() < 2 - 1e-6
+        per = self.period_samples()
+        return not self.noise.get(channel) and (per is None or whole_periods(self.n_samples, per) < 2)
+
+
+def whole_periods(samples: int, per_period: float) -> int:
+    """How many periods of so many samples a record holds; one that lacks less than a sample of its end is whole: where periods do
+    not divide the sampling, four of them end between two samples."""
+    return int(np.floor((samples + 1 - ALL_BUT_A_SAMPLE) / per_period))
 
 
 NO_ANSWER = "the {channel} does not follow the {drive}: its periods share no more than noise does; check the wiring and the column"
@@ -213,6 +220,7 @@ def fundamental(x: np.ndarray, dt: float, hint=None) -> float | None:
     return refined if agrees or left < 0.3 * left_else or (refined > found and left < 1.2 * left_else) else found
 
 
+ALL_BUT_A_SAMPLE = 1e-3  # of a sample, by which less than one must be lacking
 UNLIKE = 2e-3  # of a drive's power, by which its periods may differ: where they do by more, they may be parts of longer ones, as of two tones of like pitch
 
 

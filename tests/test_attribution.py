@@ -1024,6 +1024,23 @@ def test_a_further_effect_that_promises_next_to_nothing_is_not_tried_on_the_fine
     assert fitting.search._hopeless(current, candidate("creep", z), excess_of(current)) is hopeless
 
 
+@pytest.mark.parametrize(
+    ("first", "delay", "form"),
+    [("amplifier_lag", -2e-4, True), ("amplifier_lag", 2e-4, False), ("duffing_stiffness", -2e-4, False)],
+    ids=["takes back", "adds", "alone"],
+)
+def test_a_delay_below_none_beside_a_lag_is_that_lags_form(first, delay, form):
+    """A current loop whose step overshoots came as an amplifier_lag of 229 us and a transport_delay of -193 us, both named."""
+    rod = load_bench("aa-050h").actuator().with_effect(CLASSES[first](1e-4)).with_effect(CLASSES["transport_delay"](delay))
+    best = trial("transport_delay", 0.9, base=60.0)
+    best.result.actuator = rod
+    plain = trial("none", 90.0).result
+    state = Reached(trial(first, 60.0, base=90.0).result, [(trial(first, 60.0, base=90.0), [], [], plain)], {})
+    assert fitting.search._makes_up_for_form(state, plain, best) is form
+    told = fitting.verdict._form(dataclasses.replace(state, current=best.result, form="transport_delay"))
+    assert ("one lag of another shape, late by -100 us in all" in told) is form
+
+
 def test_what_the_form_of_a_law_leaves_promises_nothing():
     """A hundredth of a per cent of what was found is left by the law's form, however it scores."""
     base, after = (trial("excess_loss", x).result for x in (150.0, 2.1))
@@ -1119,7 +1136,7 @@ def test_an_early_effect_that_takes_as_little_as_the_others_form_leaves_is_dropp
     first, second = trial("delta_e", 60.0, base=plain), trial("duffing_stiffness", 0.98, base=60.0)
     state = Reached(fitted(0.98), [(first, [first], [first], fitted(plain)), (second, [second], [second], fitted(60.0))], {})
     targets = []
-    monkeypatch.setattr(fitting.exchange, "_nothing", lambda result, name: False)
+    monkeypatch.setattr(fitting.exchange, "is_nothing", lambda result, name: False)
 
     def fit_on(current, fewer, target):
         targets.append(target)
@@ -1141,7 +1158,7 @@ def test_the_last_effect_is_asked_for_once_more_where_others_are_not_those_it_wa
 
     plain, ended = fitted(309.0), fitted(0.95)
     steps = [(trial(n, 1.0, base=309.0), [], [], plain) for n in ("excess_loss", "second_eddy_path", "second_mode")]
-    monkeypatch.setattr(fitting.exchange, "_nothing", lambda result, name: False)
+    monkeypatch.setattr(fitting.exchange, "is_nothing", lambda result, name: False)
     monkeypatch.setattr(fitting.search, "exchange", lambda *a: changed)
     monkeypatch.setattr(fitting.search, "commuted", lambda *a: False)
 
@@ -1409,12 +1426,15 @@ def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch
 def test_a_plain_fit_that_settled_in_a_valley_is_begun_anew_from_where_effects_led():
     """An effect that takes far more than any promised to first order was credited with the way out of it."""
     from fitting.plain import better_valley
-    from magjax.bench import load_bench
     from magjax.effects import Creep
 
     rod = load_bench("aa-050h").actuator()
-    plain = SimpleNamespace(chi2_per_sample=4.4, data_count=COUNT, actuator=rod, spectra=(), choices=Choices())
-    moved = SimpleNamespace(chi2_per_sample=1.0, data_count=COUNT, actuator=rod.with_effect(Creep()), spectra=(), choices=Choices())
+    def fitted(chi2n, actuator=rod, value=1.0):
+        estimate = SimpleNamespace(value=value, stderr=0.9)
+        more = {"actuator": actuator, "spectra": (), "choices": Choices(), "estimate": lambda name: estimate}
+        return SimpleNamespace(chi2_per_sample=chi2n, data_count=COUNT, **more)
+
+    plain, moved = fitted(14.4), fitted(11.0, rod.with_effect(Creep()), value=9.0)
     asked = []
 
     class Told(Task):
@@ -1422,11 +1442,15 @@ def test_a_plain_fit_that_settled_in_a_valley_is_begun_anew_from_where_effects_l
             asked.append((start, actuator.effects))
             return SimpleNamespace(chi2_per_sample=self.recordings[0], data_count=COUNT)
 
-    found = better_valley(Told((1.3,), None), plain, [candidate("creep", 9.0)], moved)
-    assert found.chi2_per_sample == 1.3 and asked == [(moved, ())]
+    found = better_valley(Told((11.3,), None), plain, [candidate("creep", 9.0)], moved)
+    assert found.chi2_per_sample == 11.3 and asked == [(moved, ())]
     # a fit that falls little was at its best, and one effect that kept its promise is not asked about
-    assert better_valley(Told((4.0,), None), plain, [candidate("creep", 9.0)], moved) is None and len(asked) == 2
-    assert better_valley(Told((1.3,), None), plain, [candidate("creep", 40.0)], moved) is None and len(asked) == 2
+    assert better_valley(Told((14.0,), None), plain, [candidate("creep", 9.0)], moved) is None and len(asked) == 2
+    kept = [candidate("creep", 40.0)]
+    assert better_valley(Told((11.3,), None), plain, kept, moved) is None and len(asked) == 2
+    # but where it is within its errors of none, or little was left
+    assert better_valley(Told((11.3,), None), plain, kept, fitted(11.0, moved.actuator)) and len(asked) == 3
+    assert better_valley(Told((1.3,), None), fitted(4.4), kept, fitted(1.0, moved.actuator, value=9.0)) and len(asked) == 4
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from tests.blind.generator.bench import ConcealedBench
 from tests.blind.generator.coil import shell_matrix
 from tests.blind.generator.density import KINDS, SPAN, PlayDensity
 from tests.blind.generator.instruments import record
-from tests.blind.generator.strain import settled_play
+from tests.blind.generator.rod import displacement
+from tests.blind.generator.strain import free_displacement, settled_play
 from tests.blind.oracle import FILE as ORACLE
 from tests.blind.oracle import RIVALS, Sight
 from tests.blind.run import diagnose, run_cases
@@ -78,6 +79,23 @@ def test_every_effect_acts_and_grows(name):
     weak, strong = ({**VISIBLE, **HIDDEN, **OUTSIDE}[name][k] for k in (0, 2))
     low, high = (np.sqrt(np.mean((reading({name: s}) - base) ** 2)) for s in (weak, strong))
     assert 3e-9 < low < high < 1e-5
+
+
+@pytest.mark.parametrize(
+    "name", ["duffing_stiffness", *(pytest.param(n, marks=pytest.mark.long) for n in ("delta_e", "coulomb_friction", "end_stop"))]
+)
+def test_structural_damping_acts_beside_what_is_stepped(name):
+    pair = {name: {**VISIBLE, **OUTSIDE}[name][1], "structural_damping": 0.04}
+    bench = ConcealedBench(TRUTH, pair, "gauss", "demagnetized", np.random.default_rng(5))
+    M = bench.run(DRIVES[::2], steps=500, settle=1)["M"]
+    frequency = np.array([d["frequency"] for d in DRIVES[::2]])
+    free = free_displacement(M, M, {})
+    both, alone, base, damped = (
+        displacement(free, M, frequency, TRUTH, e)
+        for e in (pair, {name: pair[name]}, {}, {"structural_damping": 0.04})
+    )  # fmt: skip
+    acts = np.sqrt(np.mean((damped - base) ** 2))
+    assert np.sqrt(np.mean((both - alone - (damped - base)) ** 2)) < 0.3 * acts
 
 
 def test_static_limit_is_the_preisach_integral():

@@ -693,6 +693,25 @@ def test_a_transient_is_a_data_problem(bench):
     assert text is not None and "transient" in text
 
 
+@pytest.mark.parametrize(("decay", "told"), [(0.2 / 50, True), (np.inf, False)], ids=["a transient", "a tone"])
+def test_of_two_periods_the_first_is_unsettled_only_where_it_settles(bench, decay, told):
+    """A carrier folded down by the sampling was called a transient, for there is no third period to differ from the second."""
+    run = study(bench)[0][1]
+    two = run.time < 2 / run.frequency() - 1e-9
+    t, y = run.time[two], run.channels["displacement"][two]
+    beside = 2.0 * np.exp(-t / decay) * np.cos(2 * np.pi * 20.45 * run.frequency() * t if decay == np.inf else 0.0 * t)
+    channels = {k: v[two] for k, v in run.channels.items()} | {"displacement": y + 0.06 * np.ptp(y) * beside}
+    bad = Recording(t, channels, {}, run.origin, "two")
+    (s,) = spectra_of([bad], bench)
+    assert s.periods == 2
+    s = dataclasses.replace(s, noise=dataclasses.replace(s.noise, white=1e-24))  # as for a noise that is all flicker
+    text = data_problem([bad], [s], "displacement")
+    assert ("transient" in text) == told
+    if not told:  # named to half an order, which is what two periods resolve
+        near = float(text.split("a tone near ")[1].split(" Hz")[0])
+        assert abs(near / run.frequency() - 20.45) <= 0.5 and "interference" in text and "wait" not in text
+
+
 def test_a_drift_by_the_root_of_time_is_no_transient(bench):
     runs, _ = study(bench)
     run = runs[1]

@@ -27,7 +27,7 @@ from fitting.outcome import beyond_the_rod, guessed, loose, valleys
 from fitting.recipe import recipe_beside
 from fitting.screen import screened
 from fitting.setup import Choices, build_problem, free_parameters, spectra_of
-from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bent_step, bounded_minimum
+from fitting.solver import ProjectedLevenbergMarquardt, SteppedLevenbergMarquardt, bounded_minimum, led_back
 from fitting.spectra import estimate_noise, fit_lines, reduce_recording, with_noise
 from fitting.starts import agreeing, equation_error_start, operator_rows, unfold
 from fitting.steps import stepped
@@ -36,7 +36,7 @@ from magjax.bench import load_bench
 from magjax.effects import SensorNonlinearity
 from magjax.errors import ConfigurationError, RecordingError
 from magjax.preisach import Preisach, density_masses
-from magjax.recording import Recording
+from magjax.recording import Recording, whole_periods
 from magjax.simulate import simulate
 from tests.studies.joint_fit import NAMES, SINES, TRUTH, one_draw, settled
 
@@ -769,8 +769,31 @@ def test_lambda_s_freed_with_a_prior_comes_back_and_the_valley_is_told(recording
     assert "a valley" in got.message and "lambda_s" in got.message
 
 
-def test_a_bent_step_follows_the_valley():
-    """r = (50 (a b - 1), a - 3): along a b = 1 a straight step leaves the valley, a bent one hardly."""
+@pytest.mark.parametrize(
+    ("samples", "per_period", "whole"),
+    [(983, 8192 / 25, 3), (1000, 250.003, 4), (1000, 249.997, 4), (999, 250.0, 3), (300, 100.0, 3), (301, 100.0, 3), (80, 100.0, 0)],
+)
+def test_periods_that_do_not_divide_the_sampling_lose_none(samples, per_period, whole):
+    """Three periods of 25 Hz at 8192 a second end between two samples: int(3 / 25 * 8192) of them hold all three."""
+    assert whole_periods(samples, per_period) == whole
+
+
+def test_a_record_that_ends_between_two_samples_is_used_to_its_end():
+    rate, f, noise = 8192.0, 25.0, 5e-8
+    t = np.arange(int(3 / f * rate)) / rate
+    rng = np.random.default_rng(3)
+    y = 1e-5 * np.sin(2 * np.pi * f * t - 0.4) + 2e-6 * np.cos(4 * np.pi * f * t) + noise * rng.normal(size=len(t))
+    run = Recording(t, {"current": 0.5 * np.sin(2 * np.pi * f * t), "displacement": y}, name="rate")
+    s = reduce_recording(run, "current", "displacement")
+    assert (s.periods, s.samples) == (3, len(t))
+    assert abs(s.reading[1] - 0.5e-5 * np.exp(-1j * (0.4 + np.pi / 2))) < 4 * noise / np.sqrt(len(t))
+    assert abs(s.reading[2] - 1e-6) < 4 * noise / np.sqrt(len(t))
+    assert run.repeats("displacement").shape == (3, 328) and not run.noise_is_a_guess("displacement")
+    assert run.repeat_noise("displacement") == pytest.approx(noise, rel=0.15)
+
+
+def test_a_step_is_led_back_into_the_valley_that_it_left():
+    """r = (50 (a b - 1), a - 3): along a b = 1 a straight step leaves the valley; led back it falls, by the Jacobian at hand."""
 
     def residual(z):
         return np.array([50 * (z[0] * z[1] - 1), z[0] - 3, 0.0])
@@ -780,12 +803,32 @@ def test_a_bent_step_follows_the_valley():
     J = np.array([[50 * z[1], 50 * z[0]], [1.0, 0.0], [0.0, 0.0]])
     r, normal = residual(z), J.T @ J
     new = z - np.linalg.solve(normal + damping * np.diag(np.diag(normal)), J.T @ r)
-    bent = bent_step(residual, bounds, z, new, r, J, normal, damping)
-    straight_cost, bent_cost, cost = (float(np.sum(residual(x) ** 2)) for x in (new, bent, z))
-    assert straight_cost > 5 * cost and bent_cost < 0.75 * cost and bent[0] > 1.2
-    bounds = np.zeros(2), np.full(2, np.inf)
-    held = bent_step(residual, bounds, np.array([1.0, 0.1]), np.array([1.2, 0.0]), r, J, normal, damping)
-    assert held[1] == 0.0  # what the step has put at its bound stays there
+    back = led_back(normal, J.T @ (residual(new) - r) - normal @ (new - z), new, damping, bounds)
+    straight_cost, back_cost, cost = (float(np.sum(residual(x) ** 2)) for x in (new, back, z))
+    assert straight_cost > 5 * cost and back_cost < 0.75 * cost and back[0] > 1.2
+    held = led_back(normal, np.array([1.0, -9.0]), np.array([1.2, 0.0]), damping, (np.zeros(2), np.full(2, np.inf)))
+    assert held[1] == 0.0 and held[0] < 1.2  # what the step has put at its bound stays there
+
+
+@pytest.mark.parametrize(("rises", "asked"), [(1.0, True), (3.0, False)], ids=["a little", "far"])
+def test_a_step_that_rises_far_is_not_led_back(monkeypatch, rises, asked):
+    """What rises by more than twice what it promised to fall is seldom saved: more damping is asked for at once."""
+    from fitting import solver
+
+    led = []
+    monkeypatch.setattr(solver, "led_back", lambda normal, gradient, new, *rest: led.append(new) or new)
+    start, count = np.array([100.0]), [0]
+
+    def fn(z, args):
+        count[0] += 1
+        size = 100.0 if count[0] == 1 else 100.0 * np.sqrt(1 + rises) if count[0] == 2 else 50.0
+        return np.array([size]), None
+
+    method = SteppedLevenbergMarquardt((np.full(1, -np.inf), np.full(1, np.inf)))
+    options = {"prior": np.zeros((1, 1)), "jacobian": lambda z: np.ones((1, 1))}
+    state = method.init(fn, start, None, options, None, None, frozenset())
+    method.step(fn, start, None, options, state, frozenset())
+    assert bool(led) == asked
 
 
 def test_parameters_stay_between_their_bounds(monkeypatch):
@@ -818,7 +861,7 @@ def test_an_iteration_that_brings_nothing_more_ends(monkeypatch, most):
     monkeypatch.setattr(joint, "data_residual", lambda problem, z, stride=1: kinked(np.asarray(z)))
     monkeypatch.setattr(joint, "data_jacobian", lambda problem, z: sloped(z))
     monkeypatch.setattr(joint, "prior_matrix", lambda problem, weights: 1e-9 * np.eye(2))
-    monkeypatch.setattr(solver, "bent_step", lambda residual_at, bounds, y, new, *rest: new)
+    monkeypatch.setattr(solver, "led_back", lambda normal, gradient, new, *rest: new)
     monkeypatch.setattr(joint, "evidence_weights", lambda layout, penalties, z, normal, weights: weights)
     monkeypatch.setattr(joint, "AT_END", most)
     layout = SimpleNamespace(bounds=(np.full(2, -np.inf), np.full(2, np.inf)))

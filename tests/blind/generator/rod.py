@@ -4,6 +4,8 @@ import numpy as np
 
 from .strain import FULL, M_S
 
+RELAXED = 6  # rounds, each about a tenth of the one before
+
 
 def response(x, frequency, law):
     """A linear `law(s)` on one period (recordings, steps) of the fundamentals `frequency` (recordings,) in Hz."""
@@ -16,15 +18,16 @@ def displacement(free, M, frequency, truth, effects):
     w, xi = 2 * np.pi * truth["f0"], truth["xi"]
     eta, alpha = effects.get("structural_damping", 0.0), 0.12
 
-    def compliance(s):
+    def loss(s):
         # fractional Kelvin: a nearly flat phase
-        loss = eta * ((s / w) ** alpha - 1) * (s != 0) / np.sin(0.5 * np.pi * alpha) if eta else 0.0
-        return 1 / (1 + loss + 2 * xi * s / w + (s / w) ** 2)
+        return eta * ((s / w) ** alpha - 1) * (s != 0) / np.sin(0.5 * np.pi * alpha) if eta else 0.0
 
     if {"duffing_stiffness", "delta_e", "coulomb_friction", "end_stop"} & set(effects):
         y = _newmark(free, M, frequency, w, xi, effects)
+        for _ in range(RELAXED if eta else 0):  # its force by waveform relaxation: it is small beside the stiffness
+            y = _newmark(free - response(y, frequency, loss), M, frequency, w, xi, effects)
     else:
-        y = response(free, frequency, compliance)
+        y = response(free, frequency, lambda s: 1 / (1 + loss(s) + 2 * xi * s / w + (s / w) ** 2))
     if "second_mode" in effects:
         w2, xi2 = 2 * np.pi * truth.get("f2", 1000.0), truth.get("xi2", 0.04)
         y = y + effects["second_mode"] * response(free, frequency, lambda s: 1 / (1 + 2 * xi2 * s / w2 + (s / w2) ** 2))
