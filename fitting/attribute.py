@@ -121,7 +121,7 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
     `task`: a `Task`; `target`: a chi2 that it must come near to be of use. The screening's amplitude goes with a move of all
     other parameters, which stand where the base had them: where the base hides most of the effect that start may be so
     far off that the fit ends worse than without it. Then it begins anew nearer to none, from where the misfit is no
-    larger than the base's.
+    larger than the base's: of as many periods, for of fewer, where these have not settled, it is.
     """
     effect_class = CLASSES[candidate.name]
     info = effect_class.parameters()[effect_class.amplitude]
@@ -139,8 +139,10 @@ def try_effect(task, base, candidate, excess, target: float = np.inf) -> Trial:
     else:
         result = task.fit_on(base, actuator, target=target, patient=False)
         if not chi2_of(result) < chi2_of(base) and chi2_of(base) - candidate.z**2 < target:
-            nearer = effect.with_amplitude(amplitude * _no_farther(candidate, base))
-            result = min(result, task.fit_on(base, base.actuator.with_effect(nearer), target=target, patient=False), key=finite_chi2)
+            nearer = base.actuator.with_effect(effect.with_amplitude(amplitude * _no_farther(candidate, base)))
+            settled_there = dataclasses.replace(task.choices, periods=base.choices.periods)
+            again = task.fit_on(base, nearer, choices=settled_there, target=target, patient=False)
+            result = min(result, again, key=finite_chi2)
     return credited(candidate, result, base, effect, excess)
 
 

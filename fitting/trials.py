@@ -130,7 +130,9 @@ def _on_equal_terms(task, current, trials, excess) -> list[Trial]:
 
 
 def _needless(candidate, trials) -> bool:
-    """Whether a leader that meets the noise leaves only close rivals to try, and this is none: no companion of it, whose score says little."""
+    """Whether a leader that meets the noise leaves only close rivals to try, and this is none: no companion of it and no feedback, whose
+    scores say little."""
+    near = WORTH if candidate.name in FEEDBACKS else CLOSE
     met = [t for t in trials if t.physical and t.result.chi2_per_sample < SETTLED_CHI2]
     others = [t for t in met if candidate.name not in COMPANIONS.get(t.name, ())]
-    return candidate.name not in STRUCTURES and any(abs(candidate.z) < CLOSE * abs(t.candidate.z) for t in others)
+    return candidate.name not in STRUCTURES and any(abs(candidate.z) < near * abs(t.candidate.z) for t in others)

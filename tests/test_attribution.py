@@ -365,6 +365,13 @@ def test_a_linear_strain_is_tried_beside_a_quartic_one_whatever_it_scores():
     assert names(family(candidate("duffing_stiffness", 9.0), [linear], set())) == [] and _needless(linear, [trial("duffing_stiffness", 0.85)])
 
 
+def test_a_feedback_that_scores_beside_one_that_meets_the_noise_is_fitted_too():
+    """A stress_feedback of 5.9 % that the density hid scored 5.7 and was not tried, for an excess_loss scored 7.9 and met the noise."""
+    others = [trial("excess_loss", 1.02)]  # at a score of 20
+    assert not _needless(candidate("stress_feedback", 7.0), others) and _needless(candidate("stress_feedback", 5.6), others)
+    assert _needless(candidate("second_mode", 7.0), others)
+
+
 @pytest.mark.parametrize(("best", "other"), [("coulomb_friction", "backlash"), ("backlash", "coulomb_friction")])
 def test_friction_and_play_are_tried_wherever_the_other_is_best(best, other):
     """A rod with play and an after-effect: friction took 83 % of it, its rival was never tried, and the diagnosis ended unknown_at."""
@@ -1206,21 +1213,24 @@ def test_what_makes_up_for_a_form_and_makes_the_effect_needless_was_that_effect(
     ("far", "starts", "ends"), [(150.0, 2, 1.2), (30.0, 1, 30.0), (np.nan, 2, 1.2)], ids=["worse", "better", "lost"]
 )
 def test_a_start_from_which_a_fit_ends_worse_than_without_the_effect_is_taken_nearer(far, starts, ends):
-    """The score's amplitude goes with a move of all else, and the base hides 99 % of this effect: alone it moves far too much."""
+    """The score's amplitude goes with a move of all else, and the base hides 99 % of this effect: alone it moves far too much.
+    From there with the periods that the base has settled after: with three the misfit of a rod of 96 ohm was 590 for 19 there, and the
+    fit beside a second mode went astray (16; 1.2 with them)."""
     base = trial("structural_damping", 40.0, base=2000.0).result
-    base.actuator = SimpleNamespace(with_effect=lambda effect: effect)
-    begun = []
+    base.actuator, base.choices = SimpleNamespace(with_effect=lambda effect: effect), Choices(periods=(14, 8))
+    begun, periods = [], []
 
-    def fit_on(start, effect, target, patient):
+    def fit_on(start, effect, target, patient, choices=None):
         assert not patient  # more periods where others say that they are of use
-        begun.append(float(effect.gain))
+        begun.append(float(effect.gain)), periods.append(choices and choices.periods)
         return SimpleNamespace(
             chi2_per_sample=far if len(begun) == 1 else 1.2, data_count=COUNT, actuator=SimpleNamespace(effects=()), converged=True
         )
 
     c = dataclasses.replace(candidate("creep", 100.0, visibility=0.01), amplitude=0.1)
-    found = fitting.attribute.try_effect(SimpleNamespace(fit_on=fit_on), base, c, 39.0 * COUNT)
+    found = fitting.attribute.try_effect(SimpleNamespace(fit_on=fit_on, choices=Choices()), base, c, 39.0 * COUNT)
     assert found.result.chi2_per_sample == ends and len(begun) == starts and begun[0] == 0.1
+    assert periods == [None, (14, 8)][:starts]
     assert begun[1:] in ([], [pytest.approx(0.1 * np.sqrt((40.0 - 0.92) * COUNT) / 1e4)])
 
 
