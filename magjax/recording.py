@@ -137,8 +137,8 @@ class Recording:
         values, per = np.asarray(self.channels[channel], float), self.period_samples()
         if per is None:
             return np.zeros((0, 0))
-        count, width = whole_periods(len(values), per), int(round(per))
-        if abs(per - width) * count < 1e-3 and len(values) >= count * width:
+        count, width = int(np.floor(len(values) / per + 1e-6)), int(round(per))  # here the last phase of each must have been sampled
+        if abs(per - width) * count < 1e-3:
             return values[: count * width].reshape(count, width)
         from scipy.interpolate import CubicSpline
 
