@@ -233,6 +233,13 @@ def is_physical(effect) -> bool:
     return (info.low < 0 or amplitude >= 0) and abs(amplitude) <= largest and effect.is_itself()
 
 
+def taken_back(actuator) -> dict:
+    """How late each of an actuator's lags is, s, by name, where there are several and one is below none: together they are one lag of
+    another form; {} elsewhere."""
+    late = {e.name: float(getattr(e, e.amplitude)) for e in actuator.effects if e.name in LAGS}
+    return late if len(late) > 1 and min(late.values()) < 0 else {}
+
+
 def is_nothing(result, name) -> bool:
     """Whether the amplitude of an effect of a fit is within its errors of none."""
     effect = result.actuator.effect(name)

@@ -13,13 +13,13 @@ from .attribute import (
     BIC_DROP,
     FEEDBACKS,
     FORM_ERROR,
-    LAGS,
     MIN_DROP,
     MISFIT,
     chi2_of,
     excess_of,
     leaders,
     rivals_of,
+    taken_back,
     taken_beside,
     to_the_end,
     worth_ending,
@@ -275,9 +275,9 @@ def _makes_up_for_form(state, base, best) -> bool:
 
 
 def _takes_back(state, best) -> bool:
-    """Whether a further effect is a delay below none beside a lag that was found: together they are one lag of another form."""
-    late = {e.name: float(getattr(e, e.amplitude)) for e in best.result.actuator.effects if e.name in LAGS}
-    return best.name in late and any(step[0].name in late for step in state.steps) and min(late.values()) < 0
+    """Whether a further effect and a lag that was found are one lag of another form."""
+    late = taken_back(best.result.actuator)
+    return best.name in late and any(step[0].name in late for step in state.steps)
 
 
 def _not_confirmed(state, best, excess, check) -> bool:

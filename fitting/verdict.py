@@ -11,7 +11,7 @@ import numpy as np
 
 from magjax.words import sized
 
-from .attribute import LAGS, LIKE_DENSITY, MIN_DROP, MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_beside
+from .attribute import LIKE_DENSITY, MIN_DROP, MISFIT, ROUGH_CHI2, UNCONFIRMED_TIE, chi2_of, rivals_of, taken_back, taken_beside
 from .check import check_errors, foretold_text
 from .diagnosis import Diagnosis, Evidence, least_excess, misfit
 from .experiments import INSTRUMENTS, instrument_request
@@ -263,8 +263,8 @@ def _form(reached) -> str:
     """What is said of an effect that makes up for the form of the others' laws, "" where there is none."""
     if not reached.form:
         return ""
-    late = {e.name: float(getattr(e, e.amplitude)) for e in reached.current.actuator.effects if e.name in LAGS}
-    if reached.form in late and len(late) > 1 and min(late.values()) < 0:
+    late = taken_back(reached.current.actuator)
+    if reached.form in late:
         return TAKEN_BACK_TEXT.format(sized("s", sum(late.values())))
     return FORM_TEXT.format(reached.form)
 
