@@ -8,8 +8,10 @@ import numpy as np
 
 from magjax.bench import Bench
 
+from .attribute import chi2_of
 from .finer import REFINE_BELOW
 from .fit import fit_or_stop
+from .model import whitened
 from .setup import Choices, effect_parameters
 
 
@@ -18,10 +20,27 @@ def freed_beyond(result) -> tuple[str, ...]:
     return tuple(n for n in result.problem.layout.names if n not in result.bench.free)
 
 
+OFF = 3.0  # times what a fit leaves, that its model leaves after the fewest periods where it is far from settled then
+
+
 def periods_from(result):
     """Periods that a fit begins with which goes on from another: those of that one. Where physics is missing its model may have been led to
-    a loss that takes many to settle, which an effect makes needless: there with the fewest, and it goes on with more where it takes them."""
-    return Choices().periods if result.chi2_per_sample > REFINE_BELOW else result.choices.periods
+    a loss that takes many to settle, which an effect makes needless: there with the fewest, and it goes on with more where it takes them;
+    unless the model itself is far off after so few, for then the first steps go to what has not settled, and may not come back."""
+    fewest = Choices().periods
+    if result.chi2_per_sample <= REFINE_BELOW or _far_off(result, fewest):
+        return result.choices.periods
+    return fewest
+
+
+def _far_off(result, fewest: int) -> bool:
+    """Whether a fit's model is far from settled after the `fewest` periods."""
+    if np.max(result.choices.periods) <= fewest:
+        return False
+    passes, predictor = result.problem.passes, result.problem.predictors[1]
+    brief = dataclasses.replace(predictor, periods=tuple(min(fewest, n) for n in predictor.periods))
+    misfit = whitened(passes.lines(result.solution.z, brief), passes.target, np)
+    return not float(np.sum(misfit**2)) < OFF * chi2_of(result)
 
 
 LATE = 0.6  # of the time, after which nothing is begun anew
