@@ -29,6 +29,7 @@ from .diagnosis import SILENT_CHI2
 from .exchange import MOST_RIVALS, backward, both_found, commuted, exchange
 from .finer import finest
 from .foretold import Foreteller
+from .form import FILTERS, filter_takes
 from .rows import SLOW
 from .screen import screened
 from .task import Late, periods_from
@@ -41,6 +42,7 @@ HOPELESS = 2.0  # times what a repair may leave, after two effects
 LEAST_SHARE = 0.3  # of what the first effects leave above the noise, that a further one must take
 BEYOND_PROMISE = 3.0  # times what it promises to first order, that an effect may take
 OF_FORM = 0.02  # as FORM_ERROR, for what takes less than half of a misfit and leaves one
+BEYOND_FILTER = 0.25  # of what a further effect takes, that any filter of the reading leaves where it is not the form of one
 WHOLE = 1.0, 0.9  # chi2/N and share of a misfit, at which what takes as little as FORM_ERROR is named: another law seldom has just their form
 DECISIVE = 0.7  # share of what the first effect leaves, that a further one takes where check recordings need not confirm it
 HIDES = 2.0  # chi2 per number of check recordings in units of what the fit expects to miss, from which a density may hide a feedback,
@@ -271,7 +273,19 @@ def _makes_up_for_form(state, base, best) -> bool:
         return True
     half = best.result.chi2_per_sample < MISFIT or best.explained_share > HALF
     least = FORM_ERROR if half else OF_FORM
-    return best.drop < least * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best)
+    little = best.drop < least * (chi2_of(base) - chi2_of(state.current)) and not _whole(state.current, best)
+    return little and not (best.explained_share > HALF and state.current.chi2_per_sample > MISFIT and _no_filters_form(state, best, least))
+
+
+def _no_filters_form(state, best, least) -> bool:
+    """Whether a further effect takes what no form of the laws found makes: those that take enough to have such a form are filters of the
+    reading, and any other filter leaves a good part of what it takes."""
+    ends = [*(previous for *_, previous in state.steps[1:]), state.current]
+    takes = {step[0].name: chi2_of(step[3]) - chi2_of(end) for step, end in zip(state.steps, ends, strict=True)}
+    bent = sum(drop for name, drop in takes.items() if name not in FILTERS)
+    if not takes or best.name in FILTERS or best.drop < least * bent:
+        return False
+    return excess_of(state.current) - filter_takes(state.current) > BEYOND_FILTER * best.drop
 
 
 def _takes_back(state, best) -> bool:
