@@ -48,18 +48,18 @@ class Alternation:
 
 
 def alternating(recordings, spectra, output: str) -> Alternation | None:
-    """The alternation that nearly all recordings show, or None. Needs four periods of each."""
+    """The alternation that nearly all recordings show, or None. Needs three periods of each."""
     seen, cleaned, top, bottom, power, left, error = [], [], 0.0, 0.0, 0.0, 0.0, 0.0
     for recording, s in zip(recordings, spectra, strict=True):
-        if s.periods < 4:
+        if s.periods < 3:
             return None
         step = int(s.samples / s.periods)
         phases = np.arange(step) / step
         cycles = np.arange(s.samples) * s.dt * s.frequency
-        blocks = np.stack([np.interp(k + phases, cycles, s.residue) for k in range(2 * (s.periods // 2))])
-        sign = np.where(np.arange(len(blocks)) % 2 == 0, 1.0, -1.0)
-        pattern = (sign[:, None] * blocks).mean(axis=0)
-        noise = np.mean((blocks[2:] - blocks[:-2]) ** 2) / 2 / len(blocks)
+        blocks = np.stack([np.interp(k + phases, cycles, s.residue) for k in range(s.periods)])
+        even, odd = blocks[::2], blocks[1::2]
+        pattern = 0.5 * (even.mean(axis=0) - odd.mean(axis=0))
+        noise = np.mean((blocks[2:] - blocks[:-2]) ** 2) / 2 * (1 / len(even) + 1 / len(odd)) / 4
         seen.append(np.mean(pattern**2) / max(noise, 1e-300))
         wave = evaluate_lines(s.reading, phases)
         wave = wave - wave.mean()

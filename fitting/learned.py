@@ -6,6 +6,7 @@ The one that foretells recordings left out one at a time best is kept, if it doe
 
 import contextlib
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +19,10 @@ from magjax.simulate import run_chain
 from .attribute import AT_NOISE, MISFIT, excess_of
 from .check import check_errors, foretold_text
 from .diagnosis import misfit
-from .finer import FINER_FROM, REFINE_BESIDE, finer_hats
+from .finer import FINER_FROM, REFINE_BELOW, REFINE_BESIDE, finer_hats
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
-from .nonparametric import ONE, Place, locate_places
+from .nonparametric import ONE, Place, locate_places, prior_deviations
 from .plain import COARSE
 from .setup import build_problem
 from .task import Late
@@ -32,6 +33,8 @@ from .verdict import WORSE, asked_for
 TRIED = 4  # leaders that are fitted jointly
 NEAR, NEAR_IF_SIMPLE = 0.9, 0.6  # share of the best evidence that makes another boundary worth a fit; a function of one variable there beside one of two
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
+SMOOTH = 0.25  # of the range, over which a function bends that is fitted first far from the noise; and the share of the chi2 that it
+BENDS_MORE = 0.9  # leaves, of which one that bends as the evidence asks must leave less
 CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 WRONG_NAME = 0.25  # of what an effect leaves above the noise, that a learned function leaves where the effect is the wrong name
@@ -101,55 +104,84 @@ def left_out(problem, solution) -> np.ndarray:
 
 def fit_term(base, place: Place, recordings, bench, progress=None, target: float = np.inf, choices=None) -> Learned:
     """Fit a place's term jointly with density, parameters and adopted effects of a `FitResult`; `target`: a chi2 above which it is of
-    no use, and foretells nothing; `choices`: of another density than the fit's."""
+    no use, and foretells nothing; `choices`: of another density than the fit's.
+
+    Far from the noise the evidence asks for a function that bends as the rest of the model is wrong: a smooth one is fitted first
+    there, and one that bends as it asks from where that ended, where it is left with a misfit.
+    """
     say = progress or (lambda *a: None)
-    basis, choices = base.problem.basis, choices or base.choices
-    n = base.problem.layout.density_unknowns
-    names = (*base.problem.layout.names, *(f"effects.learned_term.{c}" for c in place.term.parameters()))
-    term, start, weights, z = place.term, base.solution.z, base.solution.weights, None
+    choices = choices or base.choices
+    choices = dataclasses.replace(choices, coarse=choices.fine) if max(place.term.counts) > ONE else choices
+    steps = functools.partial(say, f"learning {place.joined(str)} at the {place.block}")
+    first = max(place.length, SMOOTH) if base.chi2_per_sample > REFINE_BELOW else place.length
+    found = _with_length(base, base, place, first, bench, steps, target, choices)
+    if first > place.length and found.chi2 > MET * base.data_count:
+        finer = _with_length(base, found, place, place.length, bench, steps, target, choices)
+        found = finer if finer.chi2 < BENDS_MORE * found.chi2 else found
+    problem, solution = found.problem, found.solution
+    missed = solution.chi2 > target
+    result = finish(problem, solution, choices, bench, recordings, target=target)
+    after = result.chi2_per_sample * result.data_count
     before = base.chi2_per_sample * base.data_count
-    choices = dataclasses.replace(choices, coarse=choices.fine) if max(term.counts) > ONE else choices
+    share = (before - after) / max(before - result.data_count, 1e-9)
+    widened = found.spread * WIDEN**2 * max(result.chi2_per_sample, 1.0)
+    others = (float(left_out(base.problem, base.solution).mean()), np.inf if missed else float(left_out(problem, solution).mean()))
+    place = dataclasses.replace(place, length=found.length)
+    return Learned(place, result.actuator.effect("learned_term"), result, widened, others, float(np.clip(share, 0.0, 1.0)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fitted:
+    """A model with a term, fitted: its problem and solution; the model without the `term`, whose coefficients are `values`, with the
+    covariance `spread`."""
+
+    problem: object
+    solution: object
+    actuator: object
+    term: LearnedTerm
+    values: np.ndarray
+    spread: np.ndarray
+    length: float
+
+    @property
+    def chi2(self) -> float:
+        return float(self.solution.chi2)
+
+
+def _with_length(base, start, place, length, bench, say, target, choices) -> _Fitted:
+    """A term that bends over a `length` of its range, fitted from where the base or another fit of it (`start`) ended; once more where
+    its size has come out as another."""
+    of_base = base.problem.layout.names
+    names = (*of_base, *(f"effects.learned_term.{c}" for c in place.term.parameters()))
+    term = place.term
+    if length != place.length:
+        term = dataclasses.replace(term, deviation=jnp.asarray(prior_deviations(term.counts, length)))
+    values = np.zeros(len(term.coefficients))
+    if isinstance(start, _Fitted):
+        values, term = start.values, dataclasses.replace(term, size=start.term.size)
+    actuator, problem, solution = start.actuator, start.problem, start.solution
     for again in range(2):
-        actuator = base.actuator.with_effect(term)
-        problem, z = build_problem(base.spectra, actuator, bench, names, choices, (basis, start[: n + 1]))
-        n, basis = problem.layout.density_unknowns, problem.basis
-        z[len(z) - problem.layout.memories :] = start[len(start) - problem.layout.memories :]
-        if again:
-            z[n + 1 : n + 1 + len(names)] = moved  # noqa: F821
-        solution = solve(
-            problem, z, weights, max_jacobians=choices.max_jacobians,
-            progress=lambda k, c: say(f"learning {place.joined(str)} at the {place.block}", k, c), target=target,
-        )  # fmt: skip
-        missed = solution.chi2 > target
+        n = problem.layout.density_unknowns
+        density, levels = (problem.basis, solution.z[: n + 1]), solution.z[len(solution.z) - problem.layout.memories :]
+        problem, z = build_problem(base.spectra, actuator.with_effect(term), bench, names, choices, density)
+        z[len(z) - problem.layout.memories :] = levels
+        index = problem.layout.index(names[len(of_base)]) + np.arange(len(values))
+        z[index] = [problem.layout.coordinate(name, v) for name, v in zip(names[len(of_base) :], values, strict=True)]
+        solution = solve(problem, z, solution.weights, max_jacobians=choices.max_jacobians, progress=say, target=target)
         if solution.interrupted:
             raise KeyboardInterrupt
-        first = problem.layout.index(names[len(base.problem.layout.names)])
-        index = slice(first, first + len(term.coefficients))
-        cov = covariance(solution.normal, solution.z, problem.layout)
-        values = np.array(
-            [float(problem.layout.value(name, jnp.asarray(solution.z))) for name in names[len(base.problem.layout.names) :]]
-        )
-        slopes = np.asarray(problem.layout.scales)[index.start - n - 1 : index.stop - n - 1]
-        spread = cov[index, index] * slopes[:, None] * slopes
+        at = jnp.asarray(solution.z)
+        found = {name: float(problem.layout.value(name, at)) for name in names}
+        actuator, values = actuator.replace({name: found[name] for name in of_base}), np.array([found[name] for name in names[len(of_base) :]])
+        slopes = np.asarray(problem.layout.scales)[index - problem.layout.density_unknowns - 1]
+        spread = covariance(solution.normal, solution.z, problem.layout)[np.ix_(index, index)] * slopes[:, None] * slopes
         deviation = np.asarray(term.deviation)
         known = np.clip(1 - np.diag(spread) / deviation**2, 0.0, 1.0)  # of each coefficient, how much is the data's word
         factor = float(np.clip(np.sqrt(np.sum((values / deviation) ** 2) / max(known.sum(), 0.5)), 0.05, 20.0))
-        if again or missed or 1 / RESIZED < factor < RESIZED:
+        if again or solution.chi2 > target or 1 / RESIZED < factor < RESIZED:
             break
-        term = dataclasses.replace(term, size=term.size * factor)
-        moved = solution.z[n + 1 : n + 1 + len(names)].copy()
-        moved[index.start - n - 1 : index.stop - n - 1] /= factor
-        start, weights = solution.z, solution.weights
-        kept = {name: float(problem.layout.value(name, jnp.asarray(start))) for name in base.problem.layout.names}
-        moved[: len(kept)] = 0.0
-        base = dataclasses.replace(base, actuator=base.actuator.replace(kept))
-    result = finish(problem, solution, choices, bench, recordings, target=target)
-    fitted = result.actuator.effect("learned_term")
-    after = result.chi2_per_sample * result.data_count
-    share = (before - after) / max(before - result.data_count, 1e-9)
-    widened = spread * WIDEN**2 * max(result.chi2_per_sample, 1.0)
-    others = (float(left_out(base.problem, base.solution).mean()), np.inf if missed else float(left_out(problem, solution).mean()))
-    return Learned(place, fitted, result, widened, others, float(np.clip(share, 0.0, 1.0)))
+        term, values = dataclasses.replace(term, size=term.size * factor), values / factor
+    return _Fitted(problem, solution, actuator, term, values, spread, length)
 
 
 def chosen_places(places) -> list[Place]:

@@ -29,6 +29,8 @@ TIED, TIED_MORE = 8, 4.0  # samples that equal the extreme, and how many times a
 STUCK = 10  # equal samples in a row
 APART = 4.0  # standard deviations of a plateau's level that two of one limit may differ by, beside half a deviation of the noise
 WAVY = 8.0  # deviations of chi2 from what noise leaves of a flat plateau in means of eight samples
+KEPT = 0.5  # of the noise beside it, that a plateau has which acts before the noise
+PASSED = 0.02  # of the span, by which another recording must pass a level
 CORNER_IN_NOISE = 0.65  # a plateau of many tolerances' depth has lost the slow part of a round approach
 
 
@@ -89,15 +91,33 @@ def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarr
             _shown(channel, unit, values, *stuck),
         )
     for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
-        found = clipped_crest(sign * values, drive) or cut_in_noise(sign * values)
+        crest = clipped_crest(sign * values, drive)
+        found = crest or cut_in_noise(sign * values)
         if found is not None:
             first, length = found
             level = float(np.median(values[first : first + length]))
+            rests = {"rests": (sign, level)} if crest and _keeps_noise(values, first, length) else {}
             raise RecordingError(
                 f"{name}: {channel} is clipped at its {word} value {sized(unit, level, digits=4)} for {length} samples from sample {first}; "
                 "lower the gain or the drive and record again",
-                _shown(channel, unit, values, first, length),
+                {**_shown(channel, unit, values, first, length), **rests},
             )
+
+
+def _keeps_noise(values, first, length) -> bool:
+    """Whether a plateau has the noise of what is beside it, coarser than a converter's counts: what it rests by acts before the noise."""
+    noise = fast_noise(values)
+    return noise > NOISY * quantum(values) and fast_noise(values[first : first + length]) > KEPT * noise
+
+
+def is_passed(shown: dict, others) -> bool:
+    """Whether the level of a plateau that keeps its noise is passed elsewhere in the same channel: it is no limit of the instrument then,
+    but what is measured holds there, as behind a play. `shown`: of its `RecordingError`; `others`: the channel in other recordings."""
+    if "rests" not in shown:
+        return False
+    side, level = shown["rests"]
+    margin = 10 * fast_noise(shown["values"]) + PASSED * np.ptp(shown["values"])
+    return any(np.max(side * np.asarray(x, float)) > side * level + margin for x in others)
 
 
 def _shown(channel, unit, values, first, length) -> dict:

@@ -16,7 +16,8 @@ class ConfigurationError(MagjaxError):
 class RecordingError(MagjaxError):
     """A recording that cannot be used as it is (exit status 3).
 
-    `shown`: where it shows, for a picture, if that is known: channel, unit, values, first sample, samples, and time.
+    `shown`: where it shows, for a picture, if that is known: channel, unit, values, first sample, samples, and time; of a plateau that
+    keeps its noise `rests`, its (side, level).
     """
 
     exit_status = 3

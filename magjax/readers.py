@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from .bench import load_bench
-from .clipping import refuse_clipping
+from .clipping import is_passed, refuse_clipping
 from .columns import USUAL, column_of, quantity_of
 from .errors import ConfigurationError, RecordingError
 from .formats import read_table
@@ -17,8 +17,8 @@ from .recording import BYSTANDERS, Recording, refuse_constant
 WRITTEN = 1e-5  # of a channel's range: more digits than that are written
 
 
-def load_recordings(paths, bench) -> list[Recording]:
-    """Recordings of one or several files, SI, as the bench names their columns.
+def load_recordings(paths, bench, limits: bool = True) -> list[Recording]:
+    """Recordings of one or several files, SI, as the bench names their columns; not `limits`: crests that are cut flat are let through.
 
     Raises `RecordingError` naming file, column and mend.
     """
@@ -30,19 +30,35 @@ def load_recordings(paths, bench) -> list[Recording]:
         raise ConfigurationError("no recording given; name one or several files")
     recordings = []
     for path in paths:
-        recordings += read_file(Path(path), bench)
+        recordings += read_file(Path(path), bench, limits)
     return recordings
 
 
 def load_sound(paths, bench) -> tuple[list[Recording], list[RecordingError]]:
-    """The recordings that can be used, and the error of each file that cannot."""
-    recordings, errors = [], []
+    """The recordings that can be used, and the error of each file that cannot. A crest that is flat at a level which other files pass was
+    not cut by the instrument: those are used."""
+    found = []
     for path in paths:
         try:
-            recordings += load_recordings([path], bench)
+            found.append(load_recordings([path], bench))
         except RecordingError as error:
-            errors.append(error)
-    return recordings, errors
+            found.append(error)
+    found = [load_recordings([path], bench, False) if _is_no_limit(one, found) else one for path, one in zip(paths, found, strict=True)]
+    errors = [one for one in found if isinstance(one, RecordingError)]
+    return [r for one in found if not isinstance(one, RecordingError) for r in one], errors
+
+
+def _is_no_limit(error, found) -> bool:
+    """Whether what a file was refused for is a crest that is flat at a level which others pass; `found`: recordings or the error of each."""
+    if not isinstance(error, RecordingError) or "rests" not in (error.shown or {}):
+        return False
+    channel, others = error.shown["channel"], []
+    for one in found:
+        if not isinstance(one, RecordingError):
+            others += [r.channels[channel] for r in one if channel in r.channels]
+        elif one is not error and (one.shown or {}).get("channel") == channel:
+            others.append(one.shown["values"])
+    return is_passed(error.shown, others)
 
 
 def load_checks(paths, bench) -> tuple[list[Recording], tuple[str, ...]]:
@@ -127,14 +143,14 @@ def read_columns(path: Path, bench, quantities) -> dict:
     return {q: v for q, v in found.items() if v is not None}
 
 
-def read_file(path: Path, bench) -> list[Recording]:
-    """All recordings in one file."""
+def read_file(path: Path, bench, limits: bool = True) -> list[Recording]:
+    """All recordings in one file; `limits` as of `load_recordings`."""
     tables = read_table(path)
     origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-    return [r for table, metadata in tables for r in _recordings(path, table, {**origin, "metadata": metadata}, bench)]
+    return [r for table, metadata in tables for r in _recordings(path, table, {**origin, "metadata": metadata}, bench, limits)]
 
 
-def _recordings(path, table, origin, bench) -> list[Recording]:
+def _recordings(path, table, origin, bench, limits) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
     columns, units, available = {}, {}, list(table)
     _refuse_missing(path, table, bench)
@@ -171,15 +187,15 @@ def _recordings(path, table, origin, bench) -> list[Recording]:
         parts = [(f"{path.name}[{split}={label:g}]", table[split] == label) for label in labels]
     else:
         parts = [(path.name, np.ones(len(columns[bench.drive]), bool))]
-    if not bench.quasistatic:
+    if limits and not bench.quasistatic:
         for name, rows in parts:
             _refuse_clipping(name, {q: v[rows] for q, v in columns.items()}, bench)
     if bench.columns.get("time", {}).get("merge"):
         columns, filled = merge_captures([{q: v[rows] for q, v in columns.items()} for _, rows in parts], bench, path)
         if filled:
             origin = {**origin, "metadata": {**origin["metadata"], "bridged_samples": filled}}
-        return [_one(path.name, columns, units, origin, bench)]
-    return [_one(name, {q: v[rows] for q, v in columns.items()}, units, origin, bench) for name, rows in parts]
+        return [_one(path.name, columns, units, origin, bench, limits)]
+    return [_one(name, {q: v[rows] for q, v in columns.items()}, units, origin, bench, limits) for name, rows in parts]
 
 
 def _refuse_missing(path, table, bench):
@@ -205,7 +221,7 @@ def _refuse_clipping(name, columns, bench):
                 raise
 
 
-def _one(name, columns, units, origin, bench) -> Recording:
+def _one(name, columns, units, origin, bench, limits) -> Recording:
     quasistatic = bench.quasistatic
     count = len(columns[bench.drive])
     if count < 2:
@@ -241,7 +257,7 @@ def _one(name, columns, units, origin, bench) -> Recording:
         dt = float(np.median(np.diff(time)))
         channels[bench.output] = integrate_emf(channels[bench.output], channels[bench.drive], dt, column)
     metadata = {k: _number(v) for k, v in metadata.items()}
-    return Recording(time, channels, {}, {**origin, "metadata": metadata}, name)
+    return Recording(time, channels, {}, {**origin, "metadata": metadata}, name, judged=not limits)
 
 
 def _number(value):

@@ -9,7 +9,7 @@ from magjax.bench import load_bench
 from magjax.clipping import clipped_crest, cut_in_noise, quantum, refuse_clipping, stuck_stretch
 from magjax.errors import RecordingError
 from magjax.formats import read_csv
-from magjax.readers import load_recordings
+from magjax.readers import load_recordings, load_sound
 from magjax.recording import Recording
 
 BITS = (8, 12, 16, None)
@@ -233,6 +233,27 @@ def test_a_cut_crest_is_seen_before_a_gap_in_it_is_filled(tmp_path):
     np.savetxt(tmp_path / "r.csv", rows[keep], delimiter=",", header="time_s,current_A,displacement_m", comments="", fmt="%.12g")
     with pytest.raises(RecordingError, match="displacement is clipped at its highest value 6 um for"):
         load_recordings([tmp_path / "r.csv"], "aa-050h")
+
+
+@pytest.mark.parametrize(
+    ("runs", "after", "used"),
+    [(((1.0, 0.7), (0.7, 0.5), (1.3, np.inf)), True, 3), (((1.0, 0.7), (1.3, 0.7), (0.5, np.inf)), True, 1), (((1.0, 0.7), (0.7, 0.5), (1.3, np.inf)), False, 1)],
+    ids=["holds", "a limit", "cut with its noise"],
+)  # fmt: skip
+def test_a_level_that_other_recordings_pass_is_no_limit(tmp_path, runs, after, used):
+    """Behind a play in the sensor the turning points of some records are flat with corners, each at its own level: they were refused as
+    clipped. A limit is one for all, and a converter's cuts the noise, too. `runs`: (amplitude, where its crest is flat) of each."""
+    rng, t = np.random.default_rng(3), np.arange(1600) / 20000
+    drive, paths = np.sin(2 * np.pi * 50 * t), []
+    for k, (amplitude, level) in enumerate(runs):
+        noise = 3e-3 * rng.standard_normal(len(t))
+        x = np.minimum(amplitude * drive, level) + noise if after else np.minimum(amplitude * drive + noise, level)
+        paths.append(tmp_path / f"{k}.csv")
+        rows = np.stack([t, amplitude * drive, 1e-5 * x], 1)
+        np.savetxt(paths[-1], rows, delimiter=",", header="time_s,current_A,displacement_m", comments="", fmt="%.12g")
+    sound, errors = load_sound(paths, load_bench("aa-050h"))
+    assert [r.name for r in sound] == ["0.csv", "1.csv", "2.csv"][-used:]
+    assert len(errors) == 3 - used and all("clipped" in str(error) for error in errors)
 
 
 def test_measured_channels_are_not_clipped(measured):
