@@ -20,6 +20,7 @@ from fitting.task import Late
 from magjax.bench import load_bench
 from magjax.constants import MU0
 from magjax.effects import CATALOGUE, AbstractEffect
+from magjax.effects.forces import with_force
 from magjax.effects.learned_term import OUTPUTS, PLACES, LearnedTerm
 from magjax.model_file import load_model
 from magjax.simulate import run_chain, simulate
@@ -397,6 +398,82 @@ def test_a_term_is_fitted_jointly_with_the_density():
     term = LearnedTerm.null("magnetostriction", ("field",), [1e3], [2.4e4], (16,), prior_deviations((16,), 0.2), 1e-7)
     learned = fit_term(base, Place("magnetostriction", ("field",), 100.0, 0.9, 0.2, 1e-7, 0.1, term), runs, bench)
     assert learned.share > 0.6 and learned.result.chi2_per_sample < 0.7 * base.chi2_per_sample
+
+
+@pytest.mark.parametrize(
+    ("begins", "length", "ends", "asked", "kept"),
+    [
+        (778.0, 0.03, {0.25: 3.3, 0.03: 0.8}, [(0.25, None), (0.03, 3.3)], 0.03),
+        (778.0, 0.03, {0.25: 3.3, 0.03: 3.2}, [(0.25, None), (0.03, 3.3)], 0.25),
+        (778.0, 0.03, {0.25: 1.0}, [(0.25, None)], 0.25),
+        (778.0, 0.5, {0.5: 3.3}, [(0.5, None)], 0.5),
+        (6.0, 0.03, {0.03: 3.3}, [(0.03, None)], 0.03),
+    ],
+    ids=["bends", "no better", "smooth", "smoother yet", "near the noise"],
+)
+def test_far_from_the_noise_a_smooth_function_is_fitted_first(monkeypatch, begins, length, ends, asked, kept):
+    """The evidence there asks for the bends of all that is wrong: damping by the square of the velocity stalled at 242 of 778; smooth, it ended
+    at 3.3, and from there at 0.8."""
+    begun = []
+
+    def with_length(base, start, place, length, *more):
+        begun.append((length, None if start is base else start.chi2 / 100))
+        solution = types.SimpleNamespace(chi2=100 * ends[length])
+        return learned_module._Fitted(None, solution, None, place.term, np.zeros(1), np.eye(1), length)
+
+    monkeypatch.setattr(learned_module, "_with_length", with_length)
+    monkeypatch.setattr(learned_module, "left_out", lambda problem, solution: np.ones(2))
+
+    def finish(problem, solution, *more, **how):
+        actuator = types.SimpleNamespace(effect=lambda name: name)
+        return types.SimpleNamespace(chi2_per_sample=solution.chi2 / 100, data_count=100, actuator=actuator)
+
+    monkeypatch.setattr(learned_module, "finish", finish)
+    base = types.SimpleNamespace(chi2_per_sample=begins, data_count=100, choices=Choices(), problem=None, solution=None)
+    place = dataclasses.replace(placed("mechanics", ("displacement_rate",), 500.0), length=length)
+    learned = learned_module.fit_term(base, place, (), None)
+    assert begun == asked and learned.place.length == kept and learned.result.chi2_per_sample == ends[kept]
+
+
+class SquareDamping(AbstractEffect):
+    """A force against the motion by the square of its velocity: in no catalogue."""
+
+    name = "square_damping"
+    block = "mechanics"
+
+    def displacement(self, displacement, free_displacement, signals, line, actuator):
+        """Displacement under the force, m; 0.6 um at 1 cm/s."""
+
+        def force(y, given, series):
+            v = line.derivative(y)
+            return -6e-3 * v * jnp.abs(v)
+
+        return with_force(displacement, force, self, (), line, actuator, local=False)
+
+    @classmethod
+    def parameters(cls):
+        return {}
+
+
+@pytest.mark.long
+def test_a_damping_by_the_square_of_the_velocity_is_learned_from_far_off():
+    """Its plain model has a damping far too high, and an eddy resistance that is wrong."""
+    from fitting.fit import fit
+    from fitting.learned import fit_term
+    from fitting.nonparametric import locate_places
+
+    bench = load_bench("aa-050h")
+    truth = concealed_actuator(bench, SquareDamping()).replace({"mechanics.xi": 0.06})
+    rng = np.random.default_rng(3)
+    drives = [(f, a, 0.1) for f in (10, 40, 100, 180, 300) for a in (0.8, 0.4)]
+    runs = [record(truth, *d, rng, f"r{d[0]}-{d[1]}") for d in drives]
+    base = fit(runs, bench)
+    assert base.chi2_per_sample > 30
+    (place,) = [p for p in locate_places(base) if p.variables == ("displacement_rate",) and p.block == "mechanics"]
+    learned = fit_term(base, place, runs, bench)
+    assert learned.result.chi2_per_sample < 1.3
+    wrong = abs(base.estimate("coil.R_eddy").value / float(truth.coil.R_eddy) - 1)
+    assert abs(learned.result.estimate("coil.R_eddy").value / float(truth.coil.R_eddy) - 1) < 0.2 * wrong
 
 
 @pytest.mark.long
