@@ -29,6 +29,7 @@ from .together import SIDE_BY_SIDE, let_go, together
 from .verdict import Z_THRESHOLD
 
 IMITATES = 0.8  # share of a misfit that one effect takes where it may stand for two, which must then meet the noise
+FAR_BEHIND = 2.0  # times the chi2/N of one that is left with more than noise, at which its kin are fitted from where it ended
 NEAR_IN_DETAIL = 0.25  # of the fall of the best that meets the noise, within which others get the details of their laws, too
 
 
@@ -84,12 +85,16 @@ def try_all(task, current, top, candidates, excess, under_way, near: float = 2 *
 
 def _led(task, current, trials, excess) -> list[Trial]:
     """The trials; where one meets the noise, its kin that ended in a misfit are fitted from where it ended, too: the density under
-    it is the right one, and that of the current fit, which has bent to what is missing, may hold them far off."""
+    it is the right one, and that of the current fit, which has bent to what is missing, may hold them far off. So where it takes most of
+    a misfit and comes near the noise, those that are left with a multiple of what it leaves."""
     ahead = min(trials, key=lambda t: finite_chi2(t.result), default=None)
-    if ahead is None or not ahead.result.chi2_per_sample < SETTLED_CHI2:
+    if ahead is None:
         return trials
-    kin = COMPANIONS.get(ahead.name, ())
-    far = [t for t in trials if t.result.chi2_per_sample > MISFIT and t.name != ahead.name and (t.name in kin or of_one_family(t, ahead))]
+    left = ahead.result.chi2_per_sample
+    if not left < (ROUGH_CHI2 if ahead.explained_share > IMITATES else SETTLED_CHI2):
+        return trials
+    kin, most = COMPANIONS.get(ahead.name, ()), MISFIT if left < SETTLED_CHI2 else FAR_BEHIND * left
+    far = [t for t in trials if t.result.chi2_per_sample > most and t.name != ahead.name and (t.name in kin or of_one_family(t, ahead))]
     if not far:
         return trials
     target = chi2_of(ahead.result) + 2 * WEAK_TIE[1]

@@ -1617,6 +1617,28 @@ def test_kin_of_what_meets_the_noise_are_fitted_from_where_it_ended(monkeypatch)
 
 
 @pytest.mark.parametrize(
+    ("leaves", "kin", "base", "led"), [(1.41, 12.7, 47.0, True), (1.41, 2.7, 47.0, False), (3.1, 12.7, 47.0, False), (1.41, 12.7, 1.9, False)],
+    ids=["far behind", "near", "far from the noise", "little taken"],
+)  # fmt: skip
+def test_kin_far_behind_what_takes_most_are_fitted_from_where_it_ended(monkeypatch, leaves, kin, base, led):
+    """Beside an amplifier's limit a sensor_lag of 37 us, which was there, ended at 12.7 where an amplifier_lag came to 1.41, and later to the
+    noise: that one alone was named."""
+    rod = SimpleNamespace(without_effect=lambda name: SimpleNamespace(with_effect=lambda effect: effect), effect=lambda name: SimpleNamespace(name=name, free_parameters=tuple))
+    trials = [trial("amplifier_lag", leaves, base=base), trial("sensor_lag", kin, base=base, direction=(0, 1, 0))]
+    for t in trials:
+        t.result.actuator, t.result.choices = rod, Choices()
+
+    def fit_on(task, start, effect, **more):
+        found = trial(effect.name, 1.43, base=base).result
+        found.actuator = SimpleNamespace(effects=())
+        return found
+
+    monkeypatch.setattr(Task, "fit_on", fit_on)
+    found = fitting.trials._led(Task((), None), trial("creep", base).result, trials, 1000.0)
+    assert [t.result.chi2_per_sample for t in found] == [leaves, 1.43 if led else kin]
+
+
+@pytest.mark.parametrize(
     ("name", "rates", "gain", "creeps"),
     [
         ("creep", (2e-7, 1e-7, 3e-8), 0.02, "creep"),
