@@ -107,7 +107,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
     no use, and foretells nothing; `choices`: of another density than the fit's.
 
     Far from the noise the evidence asks for a function that bends as the rest of the model is wrong: a smooth one is fitted first
-    there, and one that bends as it asks from where that ended, where it is left with a misfit.
+    there, and one that bends as it asks from where that ended.
     """
     say = progress or (lambda *a: None)
     choices = choices or base.choices
@@ -115,7 +115,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
     steps = functools.partial(say, f"learning {place.joined(str)} at the {place.block}")
     first = max(place.length, SMOOTH) if base.chi2_per_sample > REFINE_BELOW else place.length
     found = _with_length(base, base, place, first, bench, steps, target, choices)
-    if first > place.length and found.chi2 > MET * base.data_count:
+    if first > place.length and found.chi2 < target:
         finer = _with_length(base, found, place, place.length, bench, steps, target, choices)
         found = finer if finer.chi2 < BENDS_MORE * found.chi2 else found
     problem, solution = found.problem, found.solution

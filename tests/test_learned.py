@@ -405,11 +405,11 @@ def test_a_term_is_fitted_jointly_with_the_density():
     [
         (778.0, 0.03, {0.25: 3.3, 0.03: 0.8}, [(0.25, None), (0.03, 3.3)], 0.03),
         (778.0, 0.03, {0.25: 3.3, 0.03: 3.2}, [(0.25, None), (0.03, 3.3)], 0.25),
-        (778.0, 0.03, {0.25: 1.0}, [(0.25, None)], 0.25),
+        (20.0, 0.03, {0.25: 1.01, 0.03: 0.88}, [(0.25, None), (0.03, 1.01)], 0.03),
         (778.0, 0.5, {0.5: 3.3}, [(0.5, None)], 0.5),
         (6.0, 0.03, {0.03: 3.3}, [(0.03, None)], 0.03),
     ],
-    ids=["bends", "no better", "smooth", "smoother yet", "near the noise"],
+    ids=["bends", "no better", "a stop", "smoother yet", "near the noise"],
 )
 def test_far_from_the_noise_a_smooth_function_is_fitted_first(monkeypatch, begins, length, ends, asked, kept):
     """The evidence there asks for the bends of all that is wrong: damping by the square of the velocity stalled at 242 of 778; smooth, it ended
