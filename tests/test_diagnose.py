@@ -222,6 +222,7 @@ def alone(monkeypatch, **made):
     usual = {
         "leaders": lambda candidates: candidates, "screened": lambda *a: [scored("backlash", 20.0)], "_predicts_worse": lambda *a: False,
         "refitted": lambda task, now, best, good, *a: (best, good, task), "of_two": lambda task, best, left, good, **more: (best, left),
+        "filter_takes": lambda result: np.inf,
     }  # fmt: skip
     for name, function in {**usual, **made}.items():
         monkeypatch.setattr(search_module, name, function)

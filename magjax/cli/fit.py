@@ -202,6 +202,7 @@ def run_diagnose(arguments) -> int:
     from fitting.diagnose import diagnose
     from fitting.diagnosis import unusable
     from fitting.setup import Choices
+    from fitting.still import moving_and_still
 
     recordings, checks, stopped, shown = [], [], None, None
     try:
@@ -216,7 +217,7 @@ def run_diagnose(arguments) -> int:
                              minutes=options.minutes).without_checks(refused)  # fmt: skip
             if options.placebo and found.verdict != "data_problem":
                 try:
-                    found = with_placebo(found, [*recordings, *found.parted(checks)[0]], options, progress)
+                    found = with_placebo(found, [*moving_and_still(recordings, bench)[0], *found.parted(checks)[0]], options, progress)
                 except (MagjaxError, KeyboardInterrupt) as error:  # the diagnosis itself is done and is kept
                     stopped = error
     except RecordingError as error:

@@ -1,0 +1,35 @@
+"""Recordings in which nothing moves: left out where the others say that next to nothing does, as below a threshold of the strain or
+within a play; a data problem where they say that it must."""
+
+import numpy as np
+
+from magjax.errors import RecordingError
+from magjax.recording import NO_ANSWER, follows_nothing
+from magjax.words import sized
+
+from .check import check_errors
+
+FEW = 4  # recordings for each one that may be left out
+NEXT_TO_NOTHING = 0.05  # of the others' motion, rms, that the plain model may ask of one of them
+TEXT = "Nothing but noise moves in {names}, where the plain model of the others asks for {moves}: left out."
+
+
+def moving_and_still(recordings, bench) -> tuple[list, list]:
+    """The recordings in which the reading follows the drive, and those in which it does not, where these are few; else (all, [])."""
+    moving, still = [], []
+    for r in recordings:
+        nothing = r.frequency() is not None and follows_nothing(r, bench.output)
+        (still if nothing else moving).append(r)
+    return (moving, still) if still and len(moving) >= FEW * len(still) else (list(recordings), [])
+
+
+def left_out(plain, moving, still, bench) -> str:
+    """What is said of those that are left out, by the plain fit of the others; raises `RecordingError` where it asks for motion there."""
+    rows = check_errors(plain.actuator, plain.actuator, still, bench)
+    usual = float(np.median([np.std(r.channels[bench.output]) for r in moving]))
+    asked = [np.sqrt(max(row["rms_before"] ** 2 - row["noise_rms"] ** 2, 0.0)) for row in rows]
+    for recording, rms in zip(still, asked, strict=True):
+        if not rms < NEXT_TO_NOTHING * usual:
+            raise RecordingError(f"{recording.name}: {NO_ANSWER.format(channel=bench.output, drive=recording.drive)}")
+    names = " and ".join(r.name for r in still)
+    return TEXT.format(names=names, moves=f"{sized(rows[0]['unit'], max(asked))} rms at most of {sized(rows[0]['unit'], usual)}")
