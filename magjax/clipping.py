@@ -79,8 +79,9 @@ def _in_noise(values: np.ndarray) -> float:
     return noise if noise > max(NOISY * quantum(values), SEEN * np.ptp(values)) else 0.0
 
 
-def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarray | None = None):
-    """Raise `RecordingError` where a channel, (time,), is clipped or stuck; `drive`, (time,): what may hold still meanwhile."""
+def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarray | None = None, holds=()):
+    """Raise `RecordingError` where a channel, (time,), is clipped or stuck; `drive`, (time,): what may hold still meanwhile; `holds`: sides
+    (1.0 highest, -1.0 lowest) where a plateau that keeps its noise is no limit."""
     values = np.asarray(values, float)
     unit = "V" if "emf" in channel else si_unit(channel) if channel in UNITS else ""
     stuck = stuck_stretch(values)
@@ -97,6 +98,8 @@ def refuse_clipping(name: str, channel: str, values: np.ndarray, drive: np.ndarr
             first, length = found
             level = float(np.median(values[first : first + length]))
             rests = {"rests": (sign, level)} if crest and _keeps_noise(values, first, length) else {}
+            if rests and sign in holds:
+                continue
             raise RecordingError(
                 f"{name}: {channel} is clipped at its {word} value {sized(unit, level, digits=4)} for {length} samples from sample {first}; "
                 "lower the gain or the drive and record again",

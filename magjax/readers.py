@@ -17,8 +17,9 @@ from .recording import BYSTANDERS, Recording, refuse_constant
 WRITTEN = 1e-5  # of a channel's range: more digits than that are written
 
 
-def load_recordings(paths, bench, limits: bool = True) -> list[Recording]:
-    """Recordings of one or several files, SI, as the bench names their columns; not `limits`: crests that are cut flat are let through.
+def load_recordings(paths, bench, holds=()) -> list[Recording]:
+    """Recordings of one or several files, SI, as the bench names their columns; `holds`: (channel, side) where a flat crest is no clipping,
+    side 1.0 for the highest, -1.0 for the lowest values.
 
     Raises `RecordingError` naming file, column and mend.
     """
@@ -30,22 +31,29 @@ def load_recordings(paths, bench, limits: bool = True) -> list[Recording]:
         raise ConfigurationError("no recording given; name one or several files")
     recordings = []
     for path in paths:
-        recordings += read_file(Path(path), bench, limits)
+        recordings += read_file(Path(path), bench, holds)
     return recordings
 
 
 def load_sound(paths, bench) -> tuple[list[Recording], list[RecordingError]]:
     """The recordings that can be used, and the error of each file that cannot. A crest that is flat at a level which other files pass was
     not cut by the instrument: those are used."""
-    found = []
-    for path in paths:
-        try:
-            found.append(load_recordings([path], bench))
-        except RecordingError as error:
-            found.append(error)
-    found = [load_recordings([path], bench, False) if _is_no_limit(one, found) else one for path, one in zip(paths, found, strict=True)]
+    found = [_tried(path, bench) for path in paths]
+    for k, path in enumerate(paths):
+        holds = ()
+        while _is_no_limit(found[k], found):
+            holds = (*holds, (found[k].shown["channel"], found[k].shown["rests"][0]))
+            found[k] = _tried(path, bench, holds)
     errors = [one for one in found if isinstance(one, RecordingError)]
     return [r for one in found if not isinstance(one, RecordingError) for r in one], errors
+
+
+def _tried(path, bench, holds=()):
+    """A file's recordings, or its error."""
+    try:
+        return load_recordings([path], bench, holds)
+    except RecordingError as error:
+        return error
 
 
 def _is_no_limit(error, found) -> bool:
@@ -143,14 +151,14 @@ def read_columns(path: Path, bench, quantities) -> dict:
     return {q: v for q, v in found.items() if v is not None}
 
 
-def read_file(path: Path, bench, limits: bool = True) -> list[Recording]:
-    """All recordings in one file; `limits` as of `load_recordings`."""
+def read_file(path: Path, bench, holds=()) -> list[Recording]:
+    """All recordings in one file; `holds` as of `load_recordings`."""
     tables = read_table(path)
     origin = {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-    return [r for table, metadata in tables for r in _recordings(path, table, {**origin, "metadata": metadata}, bench, limits)]
+    return [r for table, metadata in tables for r in _recordings(path, table, {**origin, "metadata": metadata}, bench, holds)]
 
 
-def _recordings(path, table, origin, bench, limits) -> list[Recording]:
+def _recordings(path, table, origin, bench, holds) -> list[Recording]:
     split = bench.columns.get("time", {}).get("split")
     columns, units, available = {}, {}, list(table)
     _refuse_missing(path, table, bench)
@@ -187,15 +195,15 @@ def _recordings(path, table, origin, bench, limits) -> list[Recording]:
         parts = [(f"{path.name}[{split}={label:g}]", table[split] == label) for label in labels]
     else:
         parts = [(path.name, np.ones(len(columns[bench.drive]), bool))]
-    if limits and not bench.quasistatic:
+    if not bench.quasistatic:
         for name, rows in parts:
-            _refuse_clipping(name, {q: v[rows] for q, v in columns.items()}, bench)
+            _refuse_clipping(name, {q: v[rows] for q, v in columns.items()}, bench, holds)
     if bench.columns.get("time", {}).get("merge"):
         columns, filled = merge_captures([{q: v[rows] for q, v in columns.items()} for _, rows in parts], bench, path)
         if filled:
             origin = {**origin, "metadata": {**origin["metadata"], "bridged_samples": filled}}
-        return [_one(path.name, columns, units, origin, bench, limits)]
-    return [_one(name, {q: v[rows] for q, v in columns.items()}, units, origin, bench, limits) for name, rows in parts]
+        return [_one(path.name, columns, units, origin, bench, holds)]
+    return [_one(name, {q: v[rows] for q, v in columns.items()}, units, origin, bench, holds) for name, rows in parts]
 
 
 def _refuse_missing(path, table, bench):
@@ -209,19 +217,20 @@ def _refuse_missing(path, table, bench):
         )
 
 
-def _refuse_clipping(name, columns, bench):
+def _refuse_clipping(name, columns, bench, holds):
     """Clipping is seen in what the converter read: before gaps are filled, captures joined or an emf is integrated."""
     for quantity, values in columns.items():
         if quantity not in ("time", *BYSTANDERS):
             what = f"the emf of {quantity}" if "emf_turns" in bench.columns.get(quantity, {}) else quantity
+            sides = [side for channel, side in holds if channel == what]
             try:
-                refuse_clipping(name, what, values, None if quantity == bench.drive else columns[bench.drive])
+                refuse_clipping(name, what, values, None if quantity == bench.drive else columns[bench.drive], sides)
             except RecordingError as error:
                 error.shown = {**error.shown, "name": name, "time": columns.get("time")}
                 raise
 
 
-def _one(name, columns, units, origin, bench, limits) -> Recording:
+def _one(name, columns, units, origin, bench, holds) -> Recording:
     quasistatic = bench.quasistatic
     count = len(columns[bench.drive])
     if count < 2:
@@ -257,7 +266,7 @@ def _one(name, columns, units, origin, bench, limits) -> Recording:
         dt = float(np.median(np.diff(time)))
         channels[bench.output] = integrate_emf(channels[bench.output], channels[bench.drive], dt, column)
     metadata = {k: _number(v) for k, v in metadata.items()}
-    return Recording(time, channels, {}, {**origin, "metadata": metadata}, name, judged=not limits)
+    return Recording(time, channels, {}, {**origin, "metadata": metadata}, name, judged=bool(holds))
 
 
 def _number(value):

@@ -256,6 +256,21 @@ def test_a_level_that_other_recordings_pass_is_no_limit(tmp_path, runs, after, u
     assert len(errors) == 3 - used and all("clipped" in str(error) for error in errors)
 
 
+@pytest.mark.parametrize(("lowest", "current", "used"), [(-0.6, 1.0, True), (-0.6, 0.5, False)], ids=["both sides", "the current too"])
+def test_a_hold_does_not_hide_what_else_is_cut(tmp_path, lowest, current, used):
+    """A second plateau is asked about by itself, and a drive that is cut beside it is still refused."""
+    rng, t = np.random.default_rng(3), np.arange(1600) / 20000
+    drive, paths = np.sin(2 * np.pi * 50 * t), []
+    for k, (amplitude, ends) in enumerate(((1.0, (lowest, 0.7)), (1.3, (-np.inf, np.inf)))):
+        x = np.clip(amplitude * drive, *ends) + 3e-3 * rng.standard_normal(len(t))
+        cut = np.minimum(amplitude * drive, current) if k == 0 else amplitude * drive
+        paths.append(tmp_path / f"{k}.csv")
+        np.savetxt(paths[-1], np.stack([t, cut, 1e-5 * x], 1), delimiter=",", header="time_s,current_A,displacement_m", comments="", fmt="%.12g")
+    sound, errors = load_sound(paths, load_bench("aa-050h"))
+    assert [r.name for r in sound] == (["0.csv", "1.csv"] if used else ["1.csv"])
+    assert used or "current is clipped" in str(errors[0])
+
+
 def test_measured_channels_are_not_clipped(measured):
     for path in sorted((measured / "rod_eddy").glob("captures_*.csv")):
         table, _ = read_csv(path)
