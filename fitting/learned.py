@@ -379,7 +379,7 @@ def described(learned: Learned) -> dict:
 
     units = [terms.unit_of(UNITS[v]).replace("reading", reading) for v in term.variables]
     axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(low, high, strict=True)), indexing="ij")
-    fits = {id(place): worth for place, *worth in learned.tried}
+    fits = {_boundary(place): worth for place, *worth in learned.tried}
     return {
         "variables": named(learned.place), "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
@@ -388,12 +388,17 @@ def described(learned: Learned) -> dict:
         "boundaries": [
             {
                 "block": p.block, "variables": named(p), "evidence": p.evidence, "share": p.share, "visibility": p.visibility,
-                **dict(zip(("chi2_per_sample", "left_out"), fits.get(id(p), (None, None)), strict=True)),
+                **dict(zip(("chi2_per_sample", "left_out"), fits.get(_boundary(p), (None, None)), strict=True)),
             }
             for p in learned.places
         ],
         "rivals": [{"block": p.block, "variables": named(p)} for p in learned.rivals],
     }  # fmt: skip
+
+
+def _boundary(place) -> tuple:
+    """What a place is told by, however its function bends."""
+    return place.block, place.variables, place.term.counts
 
 
 def better_learned(base, named, blocks, recordings, bench, number: int = 1, check=(), progress=None) -> Learned | None:

@@ -247,7 +247,7 @@ def test_the_band_widens_beyond_what_was_seen():
     learned = dataclasses.replace(learned, result=result)
     content = described(learned)
     other = dataclasses.replace(place, block="sensor")
-    tried = described(dataclasses.replace(learned, places=(place, other), tried=((place, 1.2, 1.6),)))["boundaries"]
+    tried = described(dataclasses.replace(learned, places=(place, other), tried=((dataclasses.replace(place, length=0.25), 1.2, 1.6),)))["boundaries"]
     assert [(b["block"], b["chi2_per_sample"], b["left_out"]) for b in tried] == [
         ("magnetostriction", 1.2, 1.6),
         ("sensor", None, None),
