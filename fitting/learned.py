@@ -22,7 +22,7 @@ from .diagnosis import misfit
 from .finer import FINER_FROM, REFINE_BELOW, REFINE_BESIDE, finer_hats
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
-from .nonparametric import ONE, Place, locate_places, prior_deviations
+from .nonparametric import ONE, Place, locate_places
 from .plain import COARSE
 from .setup import build_problem
 from .task import Late
@@ -113,10 +113,10 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
     choices = choices or base.choices
     choices = dataclasses.replace(choices, coarse=choices.fine) if max(place.term.counts) > ONE else choices
     steps = functools.partial(say, f"learning {place.joined(str)} at the {place.block}")
-    first = max(place.length, SMOOTH) if base.chi2_per_sample > REFINE_BELOW else place.length
-    found = _with_length(base, base, place, first, bench, steps, target, choices)
-    if first > place.length and found.chi2 < target:
-        finer = _with_length(base, found, place, place.length, bench, steps, target, choices)
+    far = base.chi2_per_sample > REFINE_BELOW
+    found = _fitted(base, place.bent_over(max(place.length, SMOOTH)) if far else place, bench, steps, target, choices)
+    if found.place.length > place.length and found.chi2 < target:
+        finer = _fitted(base, place, bench, steps, target, choices, found)
         found = finer if finer.chi2 < BENDS_MORE * found.chi2 else found
     problem, solution = found.problem, found.solution
     missed = solution.chi2 > target
@@ -126,39 +126,36 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
     share = (before - after) / max(before - result.data_count, 1e-9)
     widened = found.spread * WIDEN**2 * max(result.chi2_per_sample, 1.0)
     others = (float(left_out(base.problem, base.solution).mean()), np.inf if missed else float(left_out(problem, solution).mean()))
-    place = dataclasses.replace(place, length=found.length)
-    return Learned(place, result.actuator.effect("learned_term"), result, widened, others, float(np.clip(share, 0.0, 1.0)))
+    term = result.actuator.effect("learned_term")
+    return Learned(found.place, term, result, widened, others, float(np.clip(share, 0.0, 1.0)))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Fitted:
-    """A model with a term, fitted: its problem and solution; the model without the `term`, whose coefficients are `values`, with the
-    covariance `spread`."""
+    """A model with the term of a `place`, fitted: its problem and solution; the model without the term, whose size and coefficients
+    (`values`, with their covariance `spread`) came out as these."""
 
+    place: Place
     problem: object
     solution: object
     actuator: object
-    term: LearnedTerm
+    size: object
     values: np.ndarray
     spread: np.ndarray
-    length: float
 
     @property
     def chi2(self) -> float:
         return float(self.solution.chi2)
 
 
-def _with_length(base, start, place, length, bench, say, target, choices) -> _Fitted:
-    """A term that bends over a `length` of its range, fitted from where the base or another fit of it (`start`) ended; once more where
-    its size has come out as another."""
+def _fitted(base, place, bench, say, target, choices, before: _Fitted | None = None) -> _Fitted:
+    """The term of a place, fitted from where the base ended, or another fit of it `before`; once more where its size has come out as
+    another."""
     of_base = base.problem.layout.names
     names = (*of_base, *(f"effects.learned_term.{c}" for c in place.term.parameters()))
-    term = place.term
-    if length != place.length:
-        term = dataclasses.replace(term, deviation=jnp.asarray(prior_deviations(term.counts, length)))
-    values = np.zeros(len(term.coefficients))
-    if isinstance(start, _Fitted):
-        values, term = start.values, dataclasses.replace(term, size=start.term.size)
+    start, term, values = before or base, place.term, np.zeros(len(place.term.coefficients))
+    if before is not None:
+        term, values = dataclasses.replace(term, size=before.size), before.values
     actuator, problem, solution = start.actuator, start.problem, start.solution
     for again in range(2):
         n = problem.layout.density_unknowns
@@ -181,7 +178,7 @@ def _with_length(base, start, place, length, bench, say, target, choices) -> _Fi
         if again or solution.chi2 > target or 1 / RESIZED < factor < RESIZED:
             break
         term, values = dataclasses.replace(term, size=term.size * factor), values / factor
-    return _Fitted(problem, solution, actuator, term, values, spread, length)
+    return _Fitted(place, problem, solution, actuator, term.size, values, spread)
 
 
 def chosen_places(places) -> list[Place]:

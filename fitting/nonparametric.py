@@ -70,6 +70,10 @@ class Place:
         """Whether it is a function of one variable, times another at most."""
         return len(self.variables) == 1 or self.term.counts[-1] == 1
 
+    def bent_over(self, length: float) -> "Place":
+        """The same place with a function that bends over another length."""
+        return self if length == self.length else dataclasses.replace(self, length=length, term=_with_prior(self.term, length))
+
     def joined(self, word) -> str:
         """The variables by `word(name)`: "a and b", or "a, times b" where b is a factor."""
         names = [word(v) for v in self.variables]
@@ -277,7 +281,7 @@ def locate_places(result, say=lambda *a: None) -> list[Place]:
     return sorted(found, key=lambda p: -p.evidence)
 
 
-def _with_prior(term, length, size):
+def _with_prior(term, length, size=1.0):
     deviation = prior_deviations(term.counts, length)
     return dataclasses.replace(term, deviation=jnp.asarray(deviation), size=term.size * size)
 

@@ -416,12 +416,12 @@ def test_far_from_the_noise_a_smooth_function_is_fitted_first(monkeypatch, begin
     at 3.3, and from there at 0.8."""
     begun = []
 
-    def with_length(base, start, place, length, *more):
-        begun.append((length, None if start is base else start.chi2 / 100))
-        solution = types.SimpleNamespace(chi2=100 * ends[length])
-        return learned_module._Fitted(None, solution, None, place.term, np.zeros(1), np.eye(1), length)
+    def fitted(base, place, bench, say, target, choices, before=None):
+        begun.append((place.length, before and before.chi2 / 100))
+        solution = types.SimpleNamespace(chi2=100 * ends[place.length])
+        return learned_module._Fitted(place, None, solution, None, 1.0, np.zeros(1), np.eye(1))
 
-    monkeypatch.setattr(learned_module, "_with_length", with_length)
+    monkeypatch.setattr(learned_module, "_fitted", fitted)
     monkeypatch.setattr(learned_module, "left_out", lambda problem, solution: np.ones(2))
 
     def finish(problem, solution, *more, **how):
@@ -430,9 +430,11 @@ def test_far_from_the_noise_a_smooth_function_is_fitted_first(monkeypatch, begin
 
     monkeypatch.setattr(learned_module, "finish", finish)
     base = types.SimpleNamespace(chi2_per_sample=begins, data_count=100, choices=Choices(), problem=None, solution=None)
-    place = dataclasses.replace(placed("mechanics", ("displacement_rate",), 500.0), length=length)
+    term = LearnedTerm.null("mechanics", ("displacement_rate",), [-0.02], [0.02], (48,), prior_deviations((48,), length), 1e-7)
+    place = Place("mechanics", ("displacement_rate",), 500.0, 0.9, length, 1.0, 0.4, term)
     learned = learned_module.fit_term(base, place, (), None)
     assert begun == asked and learned.place.length == kept and learned.result.chi2_per_sample == ends[kept]
+    assert np.allclose(learned.place.term.deviation, prior_deviations((48,), kept))  # what finer hats go on with
 
 
 class SquareDamping(AbstractEffect):
