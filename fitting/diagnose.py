@@ -19,7 +19,7 @@ from .beginning import Anew, Beginning
 from .diagnosis import Diagnosis, Evidence
 from .floors import data_problem, solver_floor, wrong_bench
 from .instruments import diagnose_beyond, known_instruments
-from .learned import LEAVES_MISFIT, MANY, better_learned, with_learned_term
+from .learned_verdict import LEAVES_MISFIT, MANY, better_learned, with_learned_term
 from .locate import where
 from .memories import STATES
 from .missed_check import with_missed_check

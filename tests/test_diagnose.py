@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import fitting.learned as learned_module
+import fitting.learned_verdict as learned_verdict
 import fitting.own_signals as signals_module
 import fitting.rough as rough_module
 import fitting.search as search_module
@@ -881,11 +881,11 @@ def test_a_learned_function_shows_an_effect_to_be_the_wrong_name(monkeypatch, le
     term = SimpleNamespace(counts=counts)
     place = Place(block, ("magnetization", "flux_rate"), 900.0, 0.96, 0.1, 1.0, 0.2, term)
     learned = Learned(place, term, result(leaves), None, (100.0, left_out), 0.96)
-    monkeypatch.setattr(learned_module, "learn", lambda *a: learned)
-    monkeypatch.setattr(learned_module, "region", lambda learned: (0.0, 1.0, bends))
-    monkeypatch.setattr(learned_module, "left_out", lambda *a: np.array([20.0, 60.0]))
+    monkeypatch.setattr(learned_verdict, "learn", lambda *a: learned)
+    monkeypatch.setattr(learned_verdict, "region", lambda learned: (0.0, 1.0, bends))
+    monkeypatch.setattr(learned_verdict, "left_out", lambda *a: np.array([20.0, 60.0]))
     rows = [{"rms_before": 1.5e-7, "rms_after": checks * 5e-8, "noise_rms": 5e-8}]
-    monkeypatch.setattr(learned_module, "check_errors", lambda *a: rows)
+    monkeypatch.setattr(learned_verdict, "check_errors", lambda *a: rows)
     best = trial("quartic_magnetostriction", named, 6e4)
     best = dataclasses.replace(best, candidate=dataclasses.replace(best.candidate, block="magnetostriction"))
     reached = Reached(named, [(best, [best], [best], plain)], {})
@@ -936,11 +936,11 @@ def test_effects_that_took_finer_hats_are_wrong_where_a_function_foretells_the_c
     place = Place(block, ("magnetization", "flux_rate"), 900.0, 0.96, 0.1, 1.0, 0.2, term)
     learned = Learned(place, term, result(leaves, (36, 24)), None, (100.0, 70.0), 0.96)
     targets = []
-    monkeypatch.setattr(learned_module, "region", lambda learned: (0.0, 1.0, 0.1))
-    monkeypatch.setattr(learned_module, "learn", lambda *a: targets.append(a[-1]) or learned)
-    monkeypatch.setattr(learned_module, "left_out", lambda *a: np.array([20.0, 60.0]))
+    monkeypatch.setattr(learned_verdict, "region", lambda learned: (0.0, 1.0, 0.1))
+    monkeypatch.setattr(learned_verdict, "learn", lambda *a: targets.append(a[-1]) or learned)
+    monkeypatch.setattr(learned_verdict, "left_out", lambda *a: np.array([20.0, 60.0]))
     rows = [{"rms_before": 2.6, "rms_after": checks, "noise_rms": 1.0}]
-    monkeypatch.setattr(learned_module, "check_errors", lambda *a: rows)
-    found = learned_module.better_learned(result(71.0, (18, 13)), result(2.4, knots), {"sensor"}, (), None, 1, [1])
+    monkeypatch.setattr(learned_verdict, "check_errors", lambda *a: rows)
+    found = learned_verdict.better_learned(result(71.0, (18, 13)), result(2.4, knots), {"sensor"}, (), None, 1, [1])
     assert (found is learned) == wrong
     assert (targets[0] == np.inf) == (knots > (18, 13))  # on the first hats it need not come as far

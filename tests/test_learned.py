@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import fitting.learned as learned_module
+import fitting.learned_verdict as learned_verdict
 from fitting.demo import concealed_actuator, record
 from fitting.diagnosis import Diagnosis
-from fitting.learned import Learned, _needless, band, chosen_places, described, left_out, prediction_interval, region
+from fitting.learned import Learned, _needless, chosen_places, left_out
+from fitting.learned_function import band, described, prediction_interval, region
 from fitting.nonparametric import Place, evidence, prior_deviations
 from fitting.result import write_model
 from fitting.setup import Choices
@@ -356,14 +358,14 @@ def test_a_learned_term_that_check_recordings_speak_against_is_not_kept(monkeypa
 
     learned = learned_of(placed("coil", ("flux_rate",), 300.0), 50.0, 6.0)
     learned.result.actuator = None
-    monkeypatch.setattr(learned_module, "check_errors", lambda *a: [{"rms_before": 1.0, "rms_after": after}])
-    monkeypatch.setattr(learned_module, "described", described)
+    monkeypatch.setattr(learned_verdict, "check_errors", lambda *a: [{"rms_before": 1.0, "rms_after": after}])
+    monkeypatch.setattr(learned_verdict, "described", described)
     found = Diagnosis("unknown_at", "said.", base=types.SimpleNamespace(actuator=None))
     if kept:
         with pytest.raises(Described):
-            learned_module.with_learned_term(found, None, (), None, ("a check",), learned=learned)
+            learned_verdict.with_learned_term(found, None, (), None, ("a check",), learned=learned)
     else:
-        said = learned_module.with_learned_term(found, None, (), None, ("a check",), learned=learned)
+        said = learned_verdict.with_learned_term(found, None, (), None, ("a check",), learned=learned)
         assert said.message.endswith("worse, so it is not kept.") and said.unknown is None
 
 
