@@ -261,10 +261,15 @@ def worth_ending(others: float) -> float:
     return max(2 * WEAK_TIE[1], FORM_ERROR * others)
 
 
+def taken_by(steps, k: int) -> float:
+    """The fall of chi2 by one of the effects that were adopted; `steps`: as of `search.Reached`."""
+    after = steps[k + 1][3] if k + 1 < len(steps) else steps[k][0].result
+    return chi2_of(steps[k][3]) - chi2_of(after)
+
+
 def taken_beside(steps, index=None) -> float:
-    """The fall of chi2 by all effects that were adopted, but the one at an index; `steps`: as of `search.Reached`."""
-    fits = [*(previous for *_, previous in steps), *(best.result for best, *_ in steps[-1:])]
-    return sum(chi2_of(fits[k]) - chi2_of(fits[k + 1]) for k in range(len(steps)) if k != index)
+    """The same by all of them, but the one at an index."""
+    return sum(taken_by(steps, k) for k in range(len(steps)) if k != index)
 
 
 def tie_of(best: Trial, t: Trial, near=WEAK_TIE, others: float = 0.0) -> str:

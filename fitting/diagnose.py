@@ -38,7 +38,7 @@ from .screen import screened
 from .search import search
 from .setup import Choices, spectra_of, with_held_masses
 from .spoilt import FAR, spoilt
-from .still import left_out, moving_and_still
+from .still import moving_and_still, word_on
 from .task import Clock, Late, Task
 from .told_memory import told_by_checks
 from .verdict import Z_THRESHOLD, first_alone, unexplained, verdict, without_worse
@@ -78,7 +78,7 @@ def diagnose(
     choices = with_held_masses(choices, bench, actuator)
     recordings, still = moving_and_still(recordings, bench)
     if still:
-        note = left_out(Task(tuple(recordings), bench, choices, progress, actuator).fit(), recordings, still, bench)
+        note = word_on(Task(tuple(recordings), bench, choices, progress, actuator).fit(), recordings, still, bench)
         same = {"actuator": actuator, "choices": choices, "progress": progress, "minutes": minutes}
         return diagnose(recordings, bench, check=check, calibration=calibration, **same).noted(note)
     if known := known_instruments(recordings, calibration, bench):

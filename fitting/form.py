@@ -4,11 +4,8 @@ A lag, a mode, a loss of the spring: each is one filter of the reading, known by
 would change of the lines is a gain, smooth in log f, for each of them; what that cannot make is no form of those laws.
 """
 
-import dataclasses
-
 import numpy as np
 
-from .model import whitened
 from .screen import Projector
 
 # effects that are a linear filter of the reading
@@ -19,19 +16,16 @@ PER_DECADE = 4  # knots of a free filter
 def free_filter(result) -> np.ndarray:
     """First-order change of the whitened misfit of a fit by a free linear filter of the reading: (columns, data), of hats in log f, real and
     imaginary, over the lines that stand above their deviations."""
-    problem, z = result.problem, result.refined.z
-    target = problem.passes.target
-    lines = problem.passes.lines(z, problem.predictors[1])
+    problem = result.problem
+    lines = problem.passes.lines(result.refined.z, problem.predictors[1])
     f = np.array([s.frequency for s in problem.spectra])[:, None] * np.arange(lines.shape[1])
-    seen = (f > 0) & (np.abs(lines) > target.deviations)
+    seen = (f > 0) & (np.abs(lines) > problem.passes.target.deviations)
     logs = np.log10(np.where(f > 0, f, 1.0))
     low, high = logs[seen].min(), logs[seen].max()
     count = max(int(np.ceil(PER_DECADE * (high - low))) + 1, 2)
     place = np.clip((logs - low) / max(high - low, 1e-9) * (count - 1), 0, count - 1)
     hats = np.maximum(1 - np.abs(place - np.arange(count)[:, None, None]), 0) * seen
-    changes = np.concatenate([hats * lines, 1j * hats * lines])
-    still = dataclasses.replace(target, lines=np.zeros_like(target.lines))
-    return whitened(changes, still, np)
+    return problem.passes.change(np.concatenate([hats * lines, 1j * hats * lines]))
 
 
 def filter_takes(result) -> float:

@@ -20,7 +20,6 @@ from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
 from .adjoint import SIGNALS, as_lines
-from .model import whitened
 from .screen import Projector
 
 ONE = 48  # cosines of a function of one variable
@@ -160,7 +159,6 @@ class Tangents:
         self.projector = Projector(self.problem, self.solution)
         self.fine = self.problem.predictors[1]  # a sharp function needs its samples
         passes, z = self.problem.passes, self.solution.z
-        self.target = dataclasses.replace(passes.target, lines=np.zeros_like(passes.target.lines))
         self.rows, self.marched = [], []
         for part, places, rows in passes.rows(z):
             self.marched.append(_step_signals(self.actuator.coil.scheme, *rows.path(), np.asarray(part.steps[0])[: len(places)]))
@@ -197,7 +195,7 @@ class Tangents:
                     ]
                 lines = [np.einsum("rln,crn->crl", read[:, :, at], w, optimize=True) for read, w in zip(self.read, waves, strict=True)]
         lines = as_lines(np.concatenate(lines, axis=1)[:, np.asarray(self.predictor.index)])
-        return whitened(lines, self.target, np).T
+        return self.problem.passes.change(lines).T
 
     def _waves(self, term, signals):
         return term.basis(*(signals[v] for v in term.variables), xp=np)[0]

@@ -5,11 +5,8 @@ Scored as the effects are: off everything that the base can do (`screen.Projecto
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
-from .model import whitened
 from .record_level import HUM_TONES, MAINS, pulsation_lines
 from .screen import Projector
 
@@ -87,7 +84,7 @@ def heat_score(problem, solution, zeros: bool = False) -> HeatScore:
     for row, s in zip(lines, problem.spectra, strict=True):
         own = pulsation_lines(s)[: len(row)]
         row[: len(own)] = own
-    column, residual = projector.project(_whitened(problem, lines)), projector.residual
+    column, residual = projector.project(problem.passes.change(lines)), projector.residual
     beside = _projected(problem, projector, [(n, 0, 1.0) for n in range(len(problem.spectra))] if zeros else [])
     left = column - beside @ np.linalg.lstsq(beside, column, rcond=1e-6)[0]
     power = max(float(left @ left), 1e-300)
@@ -114,11 +111,6 @@ def _projected(problem, projector, signals):
     for recording, harmonic, amplitude in signals:
         lines = np.zeros(problem.target.lines.shape, complex)
         lines[recording, harmonic] = amplitude
-        rows.append(projector.project(_whitened(problem, lines)))
+        rows.append(projector.project(problem.passes.change(lines)))
     return np.stack(rows, axis=1) if rows else np.zeros((len(projector.residual), 0))
 
-
-def _whitened(problem, lines):
-    """Lines added to the readings in units of their noise, as a change of the misfit."""
-    zero = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
-    return np.asarray(whitened(jnp.asarray(lines), zero))

@@ -81,6 +81,10 @@ class Passes:
         ]
         return np.concatenate(lines)[self.order]
 
+    def change(self, lines) -> np.ndarray:
+        """What changes of the lines, (..., recordings, harmonics + 1), change of the whitened misfit, (..., data)."""
+        return whitened(lines, dataclasses.replace(self.target, lines=np.zeros_like(self.target.lines)), np)
+
     def fields(self, z) -> list:
         """Drive, field H and magnetization M of every recording over a period of the fine grid: [(drive, H, M)], (samples,)."""
         rows = [
@@ -118,8 +122,7 @@ class Passes:
                 own[k, :, len(z) - layout.memories + place] = MEMORY * total * found.known[k, :, 0]
             rows.append(own)
         lines = as_lines(np.moveaxis(np.concatenate(rows)[self.order], 2, 0))
-        still = dataclasses.replace(self.target, lines=np.zeros_like(self.target.lines))
-        return whitened(lines, still, np).T
+        return self.change(lines).T
 
     def rows(self, z):
         """What every line asks of its march and of what is read, on the coarse grid: yields (part of the predictor, places of

@@ -19,7 +19,6 @@ from magjax.effects import CATALOGUE
 from .adjoint import as_lines
 from .columns import bare, drive_change, in_step_change, last_period, late_change, lines_of, marching, signals_of
 from .joint import data_jacobian, data_residual
-from .model import whitened
 from .spectra import reading_range
 from .together import let_go
 from .uncertainty import UNDERSMOOTH
@@ -183,8 +182,7 @@ def columns(problem, z):
         asked, found = _changes(classes, trials, part, actuator, rows, reading_range(problem.spectra), levels[places])
         lines.append(found)
     lines = np.concatenate(lines, axis=1)[:, np.asarray(predictor.index)]
-    still = dataclasses.replace(problem.passes.target, lines=np.zeros_like(problem.passes.target.lines))
-    return [(c, s, column) for (c, s), column in zip(asked, whitened(lines, still, np), strict=True)]
+    return [(c, s, column) for (c, s), column in zip(asked, problem.passes.change(lines), strict=True)]
 
 
 class Projector:

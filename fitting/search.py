@@ -21,6 +21,7 @@ from .attribute import (
     rivals_of,
     taken_back,
     taken_beside,
+    taken_by,
     to_the_end,
     worth_ending,
 )
@@ -280,10 +281,8 @@ def _makes_up_for_form(state, base, best) -> bool:
 def _no_filters_form(state, best, least) -> bool:
     """Whether a further effect takes what no form of the laws found makes: those that take enough to have such a form are filters of the
     reading, and any other filter leaves a good part of what it takes."""
-    ends = [*(previous for *_, previous in state.steps[1:]), state.current]
-    takes = {step[0].name: chi2_of(step[3]) - chi2_of(end) for step, end in zip(state.steps, ends, strict=True)}
-    bent = sum(drop for name, drop in takes.items() if name not in FILTERS)
-    if not takes or best.name in FILTERS or best.drop < least * bent:
+    bent = sum(taken_by(state.steps, k) for k, (found, *_) in enumerate(state.steps) if found.name not in FILTERS)
+    if not state.steps or best.name in FILTERS or best.drop < least * bent:
         return False
     return excess_of(state.current) - filter_takes(state.current) > BEYOND_FILTER * best.drop
 

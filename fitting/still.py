@@ -23,7 +23,7 @@ def moving_and_still(recordings, bench) -> tuple[list, list]:
     return (moving, still) if still and len(moving) >= FEW * len(still) else (list(recordings), [])
 
 
-def left_out(plain, moving, still, bench) -> str:
+def word_on(plain, moving, still, bench) -> str:
     """What is said of those that are left out, by the plain fit of the others; raises `RecordingError` where it asks for motion there."""
     rows = check_errors(plain.actuator, plain.actuator, still, bench)
     usual = float(np.median([np.std(r.channels[bench.output]) for r in moving]))

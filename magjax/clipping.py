@@ -116,8 +116,6 @@ def _keeps_noise(values, first, length) -> bool:
 def is_passed(shown: dict, others) -> bool:
     """Whether the level of a plateau that keeps its noise is passed elsewhere in the same channel: it is no limit of the instrument then,
     but what is measured holds there, as behind a play. `shown`: of its `RecordingError`; `others`: the channel in other recordings."""
-    if "rests" not in shown:
-        return False
     side, level = shown["rests"]
     margin = 10 * fast_noise(shown["values"]) + PASSED * np.ptp(shown["values"])
     return any(np.max(side * np.asarray(x, float)) > side * level + margin for x in others)

@@ -8,7 +8,7 @@ import pytest
 
 import fitting.still
 from fitting.diagnosis import Diagnosis
-from fitting.still import left_out, moving_and_still
+from fitting.still import moving_and_still, word_on
 from magjax.bench import load_bench
 from magjax.errors import RecordingError
 from magjax.recording import Recording
@@ -42,9 +42,9 @@ def test_the_others_say_whether_it_should_have_moved(monkeypatch, asks, refused)
     plain, quiet = SimpleNamespace(actuator=None), run("quiet.csv", 0.0)
     if refused:
         with pytest.raises(RecordingError, match=r"quiet\.csv: the displacement does not follow the current"):
-            left_out(plain, MOVING, [quiet], BENCH)
+            word_on(plain, MOVING, [quiet], BENCH)
     else:
-        assert "Nothing but noise moves in quiet.csv" in left_out(plain, MOVING, [quiet], BENCH)
+        assert "Nothing but noise moves in quiet.csv" in word_on(plain, MOVING, [quiet], BENCH)
 
 
 def test_a_diagnosis_of_the_others_says_what_was_left_out(monkeypatch):
@@ -57,7 +57,7 @@ def test_a_diagnosis_of_the_others_says_what_was_left_out(monkeypatch):
     module = importlib.import_module("fitting.diagnose")
     monkeypatch.setattr(module, "_diagnosed", diagnosed)
     monkeypatch.setattr(module.Task, "fit", lambda task: asked.append(len(task.recordings)))
-    monkeypatch.setattr(module, "left_out", lambda plain, moving, still, bench: f"Left out: {still[0].name}.")
+    monkeypatch.setattr(module, "word_on", lambda plain, moving, still, bench: f"Left out: {still[0].name}.")
     found = module.diagnose([*MOVING, run("quiet", 0.0)], BENCH)
     assert asked == [4, [r.name for r in MOVING]]
     assert found.message == "Nothing is missing. Left out: quiet."
