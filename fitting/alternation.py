@@ -42,7 +42,7 @@ class Alternation:
         text += f" Without it: {found.verdict.replace('_', ' ')}: {found.message}"
         unknown = {
             "block": "mechanics", "region": "every second period", "explained_share": 0.0, "amplitude": self.size, "stderr": self.stderr,
-            "share": self.share, "rms": self.rms,
+            "share": self.share, "rms": self.rms, "unit": self.unit,
         }  # fmt: skip
         return dataclasses.replace(found, verdict="unknown_at", message=text, unknown=unknown, data_problem=None)
 
@@ -56,7 +56,8 @@ def alternating(recordings, spectra, output: str) -> Alternation | None:
         step = int(s.samples / s.periods)
         phases = np.arange(step) / step
         cycles = np.arange(s.samples) * s.dt * s.frequency
-        blocks = np.stack([np.interp(k + phases, cycles, s.residue) for k in range(s.periods)])
+        residue = s.residue if s.start is None else s.residue + s.start[: s.samples]  # a decay may have taken part of it
+        blocks = np.stack([np.interp(k + phases, cycles, residue) for k in range(s.periods)])
         even, odd = blocks[::2], blocks[1::2]
         pattern = 0.5 * (even.mean(axis=0) - odd.mean(axis=0))
         noise = np.mean((blocks[2:] - blocks[:-2]) ** 2) / 2 * (1 / len(even) + 1 / len(odd)) / 4

@@ -11,7 +11,7 @@ from .check import check_errors
 
 FEW = 4  # recordings for each one that may be left out
 NEXT_TO_NOTHING = 0.05  # of the others' motion, rms, that the plain model may ask of one of them
-TEXT = "Nothing but noise moves in {names}, where the plain model of the others asks for {moves}: left out."
+TEXT = "Nothing but noise moves in {names}, which is left out: the plain model of the others asks for {asked} rms there, and they move by {usual}."
 
 
 def moving_and_still(recordings, bench) -> tuple[list, list]:
@@ -32,4 +32,5 @@ def word_on(plain, moving, still, bench) -> str:
         if not rms < NEXT_TO_NOTHING * usual:
             raise RecordingError(f"{recording.name}: {NO_ANSWER.format(channel=bench.output, drive=recording.drive)}")
     names = " and ".join(r.name for r in still)
-    return TEXT.format(names=names, moves=f"{sized(rows[0]['unit'], max(asked))} rms at most of {sized(rows[0]['unit'], usual)}")
+    asked, usual = (sized(rows[0]["unit"], x) for x in (max(asked), usual))
+    return TEXT.format(names=names, asked=asked, usual=usual)

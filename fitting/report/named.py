@@ -1,10 +1,12 @@
 """What a verdict names, in tables: effects, groups of rivals, what no effect explains, and what to record next."""
 
+from magjax.words import sized
+
 from . import learned, tables
 from .banner import spoken
 from .fit_page import FAR, doubt_of, sentence
 from .page import part, section
-from .style import percent, plain, shown, unit_text, words
+from .style import percent, plain, unit_text, words
 
 
 def named(found, facts):
@@ -80,20 +82,26 @@ def said_of(text: str) -> str:
     return text.replace("chi2", "χ²")
 
 
+def _alternation(unknown) -> list:
+    """Rows on what differs from period to period."""
+    size, error = (plain(100 * abs(unknown[k]), 3) for k in ("amplitude", "stderr"))
+    return [
+        ["size, of the motion", f"{size} ± {error} %"],
+        ["rms of what alternates", sized(unknown.get("unit", "m"), unknown["rms"])],
+        ["share of it that goes with the motion", percent(unknown["share"])],
+    ]
+
+
 def unknown_section(found, sketch):
     """What is known of that which no effect explains."""
     unknown = found["unknown"]
     if not unknown:
         return None
     rows = [["block it acts most like", unknown.get("block", "")], ["region", unknown.get("region", "")]]
-    if "explained_share" in unknown:
+    if "amplitude" in unknown:
+        rows += _alternation(unknown)
+    elif "explained_share" in unknown:
         rows.append(["share of the excess that the nearest effect explains", percent(unknown["explained_share"])])
-    more = {} if "function" in unknown else unknown
-    rows += [
-        [words(k), shown(v)]
-        for k, v in more.items()
-        if k not in ("block", "region", "explained_share") and isinstance(v, (str, int, float))
-    ]
     known = part(table=tables.table("The unknown", ["question", "answer"], rows))
     return section("What is known of it", known, *learned.parts(unknown, sketch))
 

@@ -632,6 +632,21 @@ def test_an_unknown_says_which_boundaries_were_tried_and_why_one_is_framed(folde
     assert "not tried" not in older and "left out: χ²/N" not in older  # a folder of before does not say
 
 
+def test_what_alternates_from_period_to_period_is_told_in_words(folders, tmp_path):
+    """Its table had said amplitude, stderr, share and rms as they stand in diagnosis.json, without units."""
+    found = json.loads((folders["unknown_at"] / "diagnosis.json").read_text())
+    found["unknown"] = {
+        "block": "mechanics", "region": "every second period", "explained_share": 0.0, "amplitude": -0.01618, "stderr": 3.2e-5, "share": 0.53,
+        "rms": 1.22e-6, "unit": "m",
+    }  # fmt: skip
+    (tmp_path / "diagnosis.json").write_text(json.dumps(found))
+    shutil.copy(folders["unknown_at"] / "report.npz", tmp_path)
+    table = rebuild(tmp_path).read_text(encoding="utf-8").split("The unknown</caption>")[1].split("</table>")[0]
+    said = dict(re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row.replace("\xa0", " ")) for row in table.split("<tr>")[2:])
+    assert said["size, of the motion"] == "1.62 ± 0.0032 %" and said["rms of what alternates"] == "1.22 um"
+    assert said["share of it that goes with the motion"] == "53 %" and len(said) == 5
+
+
 def test_a_block_is_shaded_by_its_share_of_what_is_above_the_noise(poor, fitted, runs):
     excess = (poor.chi2_per_sample - 1) * poor.data_count
     half, all_of_it = (Candidate("x", block, 9.0, 0.5, 0.1, {}, drop, 0.1, False) for block, drop in (("coil", 0.5 * excess), ("sensor", 9 * excess)))  # fmt: skip
