@@ -244,7 +244,7 @@ def is_nothing(result, name) -> bool:
     """Whether the amplitude of an effect of a fit is within its errors of none."""
     effect = result.actuator.effect(name)
     found = result.estimate(f"effects.{name}.{effect.amplitude}")
-    return abs(found.value - effect.parameters()[effect.amplitude].null) < NOTHING * (found.stderr or 0.0)
+    return abs(found.value - effect.parameters()[effect.amplitude].null) <= NOTHING * (found.stderr or 0.0)
 
 
 def rivals_of(best: Trial, trials, near=WEAK_TIE, others: float = 0.0) -> list[Trial]:

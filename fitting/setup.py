@@ -219,7 +219,8 @@ def field_of_rest(name: str, actuator, low: float, high: float) -> float:
 def _bounds(names, values, infos, log, bench):
     """Lowest and highest value of each free parameter, SI, infinite where there is none.
 
-    The shapes of an effect keep their bounds; its amplitude is free in sign, so that one that is not there comes out as nothing.
+    The shapes of an effect keep their bounds; its amplitude is free in sign, so that one that is not there comes out as nothing, but for a
+    `firm` one.
     A positive parameter of the plain chain stays within `REACH` of the bench's value: beyond (R_eddy without end, xi at nothing)
     its logarithm has no slope left, and a fit that a missing effect has led there never comes back.
     """
@@ -227,7 +228,7 @@ def _bounds(names, values, infos, log, bench):
     lows, highs = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for k, (name, value, info) in enumerate(zip(names, values, infos, strict=True)):
         if name.startswith("effects."):
-            lows[k], highs[k] = info.low if info.shape else -np.inf, info.high
+            lows[k], highs[k] = info.low if info.shape or info.firm else -np.inf, info.high
         elif log[k] and name not in SCANNED:
             about = float(nominal[name][0])
             given_nearby = about > 0 and abs(np.log(value / about)) < np.log(REACH) + 1e-9

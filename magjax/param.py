@@ -20,7 +20,8 @@ class ParameterInfo:
     `scale` is a typical size (same unit), `null` the value at which an effect vanishes, `shape` marks a parameter that
     means nothing while its effect is at null (a time constant, an exponent), `detail` one of these that the search frees only
     where its effect leaves a misfit, `given` one that is told and never fitted, `prior` the standard deviation
-    about its null in a fit, where recordings alone would let it wander, `typical` an expected range.
+    about its null in a fit, where recordings alone would let it wander, `typical` an expected range, `firm` an amplitude that a fit
+    keeps from falling below `low`, where nothing can be simulated.
     """
 
     unit: str
@@ -35,6 +36,7 @@ class ParameterInfo:
     prior: float | None = None
     typical: tuple[float, float] | None = None
     default: float = 0.0
+    firm: bool = False
 
 
 def as_float_array(value):
@@ -60,10 +62,11 @@ def param(
     given=False,
     prior=None,
     typical=None,
+    firm=False,
 ):
     """Declare a physical parameter as an Equinox field; see `ParameterInfo` for the arguments."""
     size = scale if scale is not None else (abs(default) if default else 1.0)
-    info = ParameterInfo(unit, meaning, low, high, size, null, shape, detail, given, prior, typical, default)
+    info = ParameterInfo(unit, meaning, low, high, size, null, shape, detail, given, prior, typical, default, firm)
     return eqx.field(default_factory=lambda: as_float_array(default), converter=as_float_array, metadata={"param": info})
 
 

@@ -1433,6 +1433,14 @@ def test_details_of_a_law_are_tried_where_its_effect_leaves_a_misfit(monkeypatch
     assert all(float(effect.stribeck) > 0 for effect in asked) and set(targets) <= {800.0}  # what others meet, these must, too
 
 
+@pytest.mark.parametrize(("value", "stderr", "nothing"), [(0.0, None, True), (0.0, 0.1, True), (0.19, 0.1, True), (0.21, 0.1, False), (0.1, None, False)])
+def test_an_amplitude_within_its_errors_of_none_is_nothing(value, stderr, nothing):
+    """At the bound of one that cannot fall below none it has no error."""
+    rod = load_bench("aa-050h").actuator().with_effect(CLASSES["field_diffusion"]())
+    result = SimpleNamespace(actuator=rod, estimate=lambda name: SimpleNamespace(value=value, stderr=stderr))
+    assert fitting.attribute.is_nothing(result, "field_diffusion") is nothing
+
+
 def test_a_plain_fit_that_settled_in_a_valley_is_begun_anew_from_where_effects_led():
     """An effect that takes far more than any promised to first order was credited with the way out of it."""
     from fitting.plain import better_valley

@@ -8,8 +8,8 @@ from ..param import param
 from .base import AbstractEffect
 from .lags import lagged
 
-KNEE = 0.9  # share from which it bends towards 1; beyond 1, or far below 0, the matrix of the shells is not positive and no
-BELOW = 0.02  # step has a solution: least share
+KNEE = 0.9  # share from which it bends towards 1; beyond 1, or below 0, the matrix of the shells is not positive and no
+BELOW = 1e-6  # step has a solution, the sooner the shorter it is (-3e-5 at 500 samples a period): least share
 ZEROS = np.array([3.83170597020751, 7.01558666981562, 10.17346813506272, 13.32369193631422, 16.47063005087763, 19.61585851046824])  # of the Bessel function J1
 WEIGHTS = 8 / ZEROS**2  # of the modes' losses in that of the cylinder, 0.88 of it; those beyond follow at once
 BEGUN = 0.9, 1e-4  # share and time, s, from which a fit of the modes begins
@@ -32,6 +32,7 @@ class FieldDiffusion(AbstractEffect):
         scale=0.3,
         null=0.0,
         typical=(0.05, 1.0),
+        firm=True,
     )
 
     alike: Float[Array, ""] = param(
