@@ -32,7 +32,8 @@ CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 SMOOTH = 0.25  # of the range, over which a function bends that is fitted first far from the noise; and the share of the chi2 that it
 BENDS_MORE = 0.9  # leaves, of which one that bends as the evidence asks must leave less
-KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept
+KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept,
+HALF = 0.5  # nor where it takes less of the excess: what acts at a block is taken there, most of it
 UNSEEN = 0.03  # of what a recording alone shows: left out, it is taken to miss no more than what is left of it by this
 RESIZED = 1.6  # change of the term's prior size that asks for another solution
 
@@ -55,9 +56,9 @@ class Learned:
 
     @property
     def worth(self) -> bool:
-        """Whether it foretells recordings that took no part better."""
+        """Whether it takes most of the excess and foretells recordings that took no part better."""
         before, after = self.left_out
-        return after < 1 + KEPT * (before - 1)
+        return self.share > HALF and after < 1 + KEPT * (before - 1)
 
 
 def left_out(problem, solution) -> np.ndarray:
@@ -193,6 +194,12 @@ def other_places(places, tried) -> list[Place]:
     return sorted((p for block, p in first.items() if block not in had), key=lambda p: -p.evidence)[:TRIED]
 
 
+def plain_places(places, tried) -> list[Place]:
+    """Every function of one variable alone that is not among those `tried`."""
+    had = {p.boundary for p in tried}
+    return [p for p in places if len(p.variables) == 1 and p.boundary not in had]
+
+
 def _needless(place, tried) -> bool:
     """Whether one of those tried meets the noise and is as simple and far ahead to first order, or is simple in the same block."""
     met = [t for t in tried if t.result.chi2_per_sample < MET and t.place.simple >= place.simple]
@@ -203,8 +210,9 @@ def _needless(place, tried) -> bool:
 def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Learned | None:
     """The term that serves best beside a fit, or None where none foretells left-out recordings better, or comes below the `target`.
 
-    Far from the noise the evidence is no more than a hint: where none of its leaders serves and there is no target, simple ones of the
-    other blocks are tried, too, and the density may be finer beside the term.
+    Far from the noise the evidence is no more than a hint, for the plain model has bent to what is missing: where none of its leaders
+    serves, or from far off none meets the noise, and there is no target, simple ones of the other blocks are tried, too, and then every
+    function of one variable; and the density may be finer beside the term.
     """
     say = progress or (lambda *a: None)
     let_go()
@@ -222,7 +230,12 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
         tried.sort(key=lambda t: np.nan_to_num(t.left_out[1], nan=np.inf))
         return any(t.worth for t in tried)
 
-    if not try_all(chosen_places(places)) and not (target == np.inf and try_all(other_places(places, [t.place for t in tried]))):
+    served, far = try_all(chosen_places(places)), base.chi2_per_sample > REFINE_BELOW
+    for others in (other_places, *[plain_places] * far) if target == np.inf else ():
+        met = any(t.result.chi2_per_sample < MET for t in tried)
+        if not served or (far and not met):
+            served = try_all(others(places, [t.place for t in tried]))
+    if not served:
         return None
     tried = [t for t in tried if np.isfinite(t.result.chi2_per_sample)]
     best, *others = _as_good(tried)
@@ -235,11 +248,12 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
 
 
 def _as_good(tried) -> list[Learned]:
-    """Of terms fitted, those that foretell recordings left out about as well as the first of them, the best one first: the simplest, and
-    of these the one that the rest of the model hides least, for another must be larger to be seen as much.
+    """Of terms that are worth it, those that foretell recordings left out about as well as the first of them, the best one first: the
+    simplest, and of these the one that the rest of the model hides least, for another must be larger to be seen as much.
     """
-    near = 1 + 1.3 * (tried[0].left_out[1] - 1) + 0.1
-    return sorted((t for t in tried if t.worth and t.left_out[1] < near), key=lambda t: (not t.place.simple, -t.place.visibility))
+    worth = [t for t in tried if t.worth]
+    near = 1 + 1.3 * (worth[0].left_out[1] - 1) + 0.1
+    return sorted((t for t in worth if t.left_out[1] < near), key=lambda t: (not t.place.simple, -t.place.visibility))
 
 
 def _on_finer_hats(learned, base, recordings, bench, progress) -> Learned:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from magjax.effects.learned_term import OUTPUTS, UNITS
+from magjax.effects.learned_term import DIRECTION, OUTPUTS, UNITS
 from magjax.programs import kept
 from magjax.simulate import run_chain
 
@@ -79,15 +79,24 @@ def prediction_interval(learned: Learned, drive, dt: float, periods: int = 3, co
     return value, np.sqrt(np.einsum("ki,kl,li->i", rows[:number], learned.covariance, rows[:number], optimize=True) + ends)
 
 
+def _levels(term) -> list:
+    """Values of the second variable at which a function is shown, [None] where it has none."""
+    if len(term.variables) == 1:
+        return [None]
+    shares = (0.0, 1.0) if term.variables[1].endswith(DIRECTION) else (0.1, 0.5, 0.9)
+    return [float(term.low[1] + s * (term.high[1] - term.low[1])) for s in shares]
+
+
+def _along(first, level) -> list:
+    return [first] if level is None else [first, np.full_like(first, level)]
+
+
 def region(learned: Learned):
     """The stretch of the first variable where the function bends: (low, high, share of the range) of 80 % of its squared
     curvature. A constant and a slope are what the base can take up; where the function bends is what it cannot."""
     term = learned.term
     first = np.linspace(float(term.low[0]), float(term.high[0]), 201)
-    levels = (
-        [[]] if len(term.variables) == 1 else [[float(term.low[1] + s * (term.high[1] - term.low[1]))] for s in (0.1, 0.5, 0.9)]
-    )
-    bend = [np.gradient(np.gradient(band(learned, first, *(np.full_like(first, v) for v in level))[0])) for level in levels]
+    bend = [np.gradient(np.gradient(band(learned, *_along(first, level))[0])) for level in _levels(term)]
     power = np.sum(np.square(bend), axis=0)
     power[:6] = power[-6:] = 0.0  # the ends are the least known
     total = np.concatenate([[0.0], np.cumsum(power) / max(power.sum(), 1e-300)])
@@ -105,10 +114,9 @@ def described(learned: Learned) -> dict:
     low, high = np.asarray(term.low), np.asarray(term.high)
     reach = BEYOND * (high[0] - low[0])
     x = np.linspace(low[0] - reach, high[0] + reach, GRID)
-    levels = [None] if len(low) == 1 else [float(low[1] + s * (high[1] - low[1])) for s in (0.1, 0.5, 0.9)]
     slices = []
-    for level in levels:
-        value, deviation = band(learned, *([x] if level is None else [x, np.full_like(x, level)]))
+    for level in _levels(term):
+        value, deviation = band(learned, *_along(x, level))
         slices.append(
             {
                 "at": level,
@@ -126,7 +134,7 @@ def described(learned: Learned) -> dict:
 
     units = [terms.unit_of(UNITS[v]).replace("reading", reading) for v in term.variables]
     axes = np.meshgrid(*(np.linspace(float(a), float(b), 41) for a, b in zip(low, high, strict=True)), indexing="ij")
-    fits = {_boundary(place): worth for place, *worth in learned.tried}
+    fits = {place.boundary: worth for place, *worth in learned.tried}
     return {
         "variables": named(learned.place), "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
@@ -135,14 +143,9 @@ def described(learned: Learned) -> dict:
         "boundaries": [
             {
                 "block": p.block, "variables": named(p), "evidence": p.evidence, "share": p.share, "visibility": p.visibility,
-                **dict(zip(("chi2_per_sample", "left_out"), fits.get(_boundary(p), (None, None)), strict=True)),
+                **dict(zip(("chi2_per_sample", "left_out"), fits.get(p.boundary, (None, None)), strict=True)),
             }
             for p in learned.places
         ],
         "rivals": [{"block": p.block, "variables": named(p)} for p in learned.rivals],
     }  # fmt: skip
-
-
-def _boundary(place) -> tuple:
-    """What a place is told by, however its function bends."""
-    return place.block, place.variables, place.term.counts

@@ -55,7 +55,7 @@ def with_learned_term(found, base, recordings, bench, check=(), progress=None, l
     learned = learned or learn(base, recordings, bench, progress)
     if learned is None:
         return dataclasses.replace(
-            found, message=found.message + " No smooth function of the signals there foretells recordings left out any better."
+            found, message=found.message + " No smooth function of the signals takes most of it and foretells recordings left out any better."
         )
     rows = tuple(check_errors(found.base.actuator, learned.result.actuator, check, bench)) if check else ()
     gained = [r["rms_after"] / max(r["rms_before"], 1e-300) for r in rows]

@@ -8,6 +8,7 @@ jointly with everything else, and the term is kept only where recordings left ou
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 
 from magjax.chain import Timeline
 from magjax.constants import MU0
-from magjax.effects.learned_term import PAD, LearnedTerm
+from magjax.effects.learned_term import DIRECTION, PAD, LearnedTerm, direction_of, is_reversible
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
@@ -30,11 +31,12 @@ ADDED_TO = {"magnetostriction": "free displacement", "mechanics": "displacement"
 LENGTHS = (0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.008)  # of the range, over which a function bends
 FINER_GAIN = 5.0  # of evidence, that more cosines must bring
 KNEE = 0.1  # of the largest rate, below which a rate counts linearly
+TRAVELS = (0.03, 0.01, 0.1)  # of the range of a signal, within which its direction comes round
 
 SETS = (
     ("source", ("current",)), ("source", ("current_rate",)), ("source", ("current", "current_rate")),
     ("coil", ("flux_rate",)), ("coil", ("flux_rate", "magnetization")), ("coil", ("flux_rate", "field")),
-    ("hysteresis", ("magnetization",)), ("hysteresis", ("field_rate",)), ("hysteresis", ("field", "magnetization")),
+    ("hysteresis", ("field",)), ("hysteresis", ("magnetization",)), ("hysteresis", ("field_rate",)), ("hysteresis", ("field", "magnetization")),
     ("hysteresis", ("field_rate", "magnetization")),
     ("magnetostriction", ("magnetization",)), ("magnetostriction", ("field",)), ("magnetostriction", ("magnetization", "field")),
     ("magnetostriction", ("magnetization", "magnetization_rate")),
@@ -43,10 +45,12 @@ SETS = (
     ("sensor", ("reading",)), ("sensor", ("reading_rate",)), ("sensor", ("reading", "reading_rate")), ("sensor", ("current_rate",)),
     ("sensor", ("current", "current_rate")), ("sensor", ("magnetization",)), ("sensor", ("flux_rate",)),
 )  # fmt: skip
-FACTORS = (  # a function of the first, times the second: a loss, an inductance, a damping that varies
+FACTORS = (  # a function of the first, times the second: a loss, an inductance, a coil, a damping, a friction that varies
     ("source", ("current", "current_rate")), ("coil", ("magnetization", "flux_rate")), ("coil", ("field", "flux_rate")),
-    ("hysteresis", ("magnetization", "field_rate")), ("mechanics", ("displacement", "displacement_rate")),
-    ("mechanics", ("magnetization", "displacement_rate")), ("sensor", ("reading", "reading_rate")),
+    ("coil", ("magnetization", "current")), ("hysteresis", ("magnetization", "field_rate")),
+    ("magnetostriction", ("magnetization", "magnetization_direction")), ("mechanics", ("displacement", "displacement_rate")),
+    ("mechanics", ("magnetization", "displacement_rate")), ("mechanics", ("displacement", "displacement_direction")),
+    ("sensor", ("reading", "reading_rate")), ("sensor", ("reading", "reading_direction")),
 )  # fmt: skip
 
 
@@ -68,6 +72,11 @@ class Place:
     def simple(self) -> bool:
         """Whether it is a function of one variable, times another at most."""
         return len(self.variables) == 1 or self.term.counts[-1] == 1
+
+    @property
+    def boundary(self) -> tuple:
+        """What it is told by, however its function bends."""
+        return self.block, self.variables, self.term.counts
 
     def bent_over(self, length: float) -> "Place":
         """The same place with a function that bends over another length."""
@@ -108,6 +117,12 @@ def _signals(predictor, actuator):
     return [jax.vmap(functools.partial(one, n))(d, t) for d, t, n in zip(predictor.drives, predictor.steps, predictor.periods, strict=True)]
 
 
+@kept
+def _directions(signal, travel):
+    """Of a periodic signal of every recording, (recordings, samples)."""
+    return jax.vmap(lambda x: direction_of(x, travel, Timeline(1.0, x.shape[0], True)))(signal)
+
+
 def _step_signals(scheme, field, magnetization, current, dt):
     """What an effect inside the step sees, over the whole march of every recording, (recordings, time)."""
     X = field + magnetization
@@ -115,7 +130,7 @@ def _step_signals(scheme, field, magnetization, current, dt):
     change = 1.5 * X - 2 * back[:, 1:-1] + 0.5 * back[:, :-2] if scheme == "bdf2" else X - back[:, 1:-1]
     pace = dt[:, None]
     moved = np.diff(field, axis=1, prepend=field[:, :1])
-    return {"field": field, "magnetization": magnetization, "flux_rate": MU0 * change / pace, "field_rate": moved / pace}
+    return {"field": field, "magnetization": magnetization, "current": current, "flux_rate": MU0 * change / pace, "field_rate": moved / pace}
 
 
 def prior_deviations(counts, length: float) -> np.ndarray:
@@ -129,14 +144,24 @@ def prior_deviations(counts, length: float) -> np.ndarray:
     return np.sqrt(np.maximum(whole, 1e-16))
 
 
-def null_term(block, variables, signals, actuator, counts) -> LearnedTerm:
-    """A term at null over the range of the signals, in the natural unit of its block."""
-    ends = np.array([[signals[v].min(), signals[v].max()] for v in variables])
-    knee = np.array([KNEE * np.abs(signals[v]).max() if v.endswith("_rate") else 0.0 for v in variables])
-    natural = {"source": np.ptp(signals["current"]), "coil": np.ptp(signals["field"]), "hysteresis": np.ptp(signals["field"])}
+def null_term(block, variables, signals, actuator, counts, travel: float = TRAVELS[0]) -> LearnedTerm:
+    """A term at null over the range of the signals, in the natural unit of its block; `travel`: of a direction among the variables, of
+    its signal's range."""
+    ends, knees = zip(*(_range_of(v, signals, travel) for v in variables), strict=True)
+    inside = np.ptp(signals["magnetization" if is_reversible(block, variables) else "field"])
+    natural = {"source": np.ptp(signals["current"]), "coil": inside, "hysteresis": inside}
     reach = np.ptp(signals["reading"]) if actuator.strained is None else float(actuator.strained.reach)
     size = 1e-3 * natural.get(block, reach)
-    return LearnedTerm.null(block, variables, ends[:, 0], ends[:, 1], counts, np.ones(int(np.prod(counts))), size, knee)
+    low, high = np.transpose(ends)
+    return LearnedTerm.null(block, variables, low, high, counts, np.ones(int(np.prod(counts))), size, np.array(knees))
+
+
+def _range_of(variable, signals, travel):
+    """(lowest, highest) and the knee of a variable."""
+    if variable.endswith(DIRECTION):
+        return (-1.0, 1.0), travel * np.ptp(signals[variable.removesuffix(DIRECTION)])
+    x = signals[variable]
+    return (x.min(), x.max()), KNEE * np.abs(x).max() if variable.endswith("_rate") else 0.0
 
 
 @kept
@@ -176,7 +201,7 @@ class Tangents:
     def columns(self, term) -> np.ndarray:
         """d (whitened misfit) / d coefficients, (data, coefficients)."""
         if term.in_step:
-            at = 2 if term.place == "coil" else 0
+            at = 2 if term.place == "coil" else int(term.reversible)
             lines = [
                 rows.of_steps(*(float(term.size) * self._waves(term, own) if k == at else None for k in range(3)))
                 for rows, own in zip(self.rows, self.marched, strict=True)
@@ -198,7 +223,12 @@ class Tangents:
         return self.problem.passes.change(lines).T
 
     def _waves(self, term, signals):
-        return term.basis(*(signals[v] for v in term.variables), xp=np)[0]
+        def at(name, knee):
+            if name.endswith(DIRECTION):
+                return np.asarray(_directions(signals[name.removesuffix(DIRECTION)], knee))
+            return signals[name]
+
+        return term.basis(*(at(v, knee) for v, knee in zip(term.variables, term.knee, strict=True)), xp=np)[0]
 
     def project(self, columns) -> np.ndarray:
         """The part of data columns that the fit cannot make."""
@@ -243,7 +273,7 @@ def applicable_sets(actuator, signals, quasistatic: bool):
             continue
         if block == "coil" and actuator.coil.drive == "voltage":
             continue
-        if any(v not in signals or np.ptp(signals[v]) == 0 for v in variables):
+        if any(v not in signals or np.ptp(signals[v]) == 0 for v in (v.removesuffix(DIRECTION) for v in variables)):
             continue
         if quasistatic and any(v.endswith("_rate") for v in variables):
             continue
@@ -258,8 +288,9 @@ def locate_places(result, say=lambda *a: None) -> list[Place]:
     found = []
     for block, variables, tried in applicable_sets(tangents.actuator, tangents.signals, tangents.problem.quasistatic):
         say(f"a function of {' and '.join(variables)} at the {block}", 0, None)
-        for counts in tried:
-            term = null_term(block, variables, tangents.signals, tangents.actuator, counts)
+        turned = any(v.endswith(DIRECTION) for v in variables)
+        for counts, travel in itertools.product(tried, TRAVELS if turned else TRAVELS[:1]):
+            term = null_term(block, variables, tangents.signals, tangents.actuator, counts, travel)
             columns = tangents.columns(term)
             if not np.isfinite(columns).all():
                 continue
@@ -285,6 +316,8 @@ def _with_prior(term, length, size=1.0):
 
 
 def _resolutions(block, variables):
+    if is_reversible(block, variables):
+        return [(ONE,)]
     if block in ("coil", "hysteresis"):
         return [IN_STEP if len(variables) == 2 else (2 * IN_STEP[0],)]
     if len(variables) == 2:

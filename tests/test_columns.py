@@ -75,10 +75,11 @@ def test_are_those_of_the_whole_chain(recordings, kinds, monkeypatch):
         assert np.linalg.norm(column - whole) < near * np.linalg.norm(whole), kind.name
 
 
-TERMS = {
-    "source": ("current",), "coil": ("flux_rate",), "magnetostriction": ("field",), "mechanics": ("displacement",), "sensor": ("reading",),
-}  # fmt: skip
-OFTEN = ("magnetostriction", "sensor")
+TERMS = (  # place, variables, whether in every run
+    ("source", "current", False), ("coil", "flux_rate", False), ("coil", "magnetization current", True), ("hysteresis", "field", True),
+    ("magnetostriction", "field", True), ("mechanics", "displacement", False), ("mechanics", "displacement displacement_direction", False),
+    ("sensor", "reading", True), ("sensor", "reading reading_direction", True),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -89,12 +90,12 @@ def tangents(recordings):
     return Tangents(SimpleNamespace(problem=problem, refined=SimpleNamespace(z=z, weights=np.array(START_WEIGHTS[: len(problem.penalties)]))))
 
 
-@pytest.mark.parametrize("place", [p if p in OFTEN else pytest.param(p, marks=pytest.mark.long) for p in TERMS])
-def test_columns_of_a_learned_term_are_those_of_the_whole_chain(tangents, place):
+@pytest.mark.parametrize(("place", "variables"), [pytest.param(p, v.split(), marks=() if often else pytest.mark.long) for p, v, often in TERMS])
+def test_columns_of_a_learned_term_are_those_of_the_whole_chain(tangents, place, variables):
     """The places behind the hysteresis had been given the columns of the signal before each, and an unknown its block."""
     problem = tangents.problem
-    term = null_term(place, TERMS[place], tangents.signals, tangents.actuator, (4,))
-    predictor = problem.predictors[0 if place in ("source", "coil") else 1]
+    term = null_term(place, tuple(variables), tangents.signals, tangents.actuator, (4, 1)[: len(variables)])
+    predictor = problem.predictors[0 if place in ("source", "coil", "hysteresis") else 1]
     target = eqx.tree_at(lambda t: t.lines, problem.target, jnp.zeros_like(problem.target.lines))
 
     def lines(size):

@@ -17,20 +17,44 @@ from ..param import ParameterInfo, as_float_array
 from .base import AbstractEffect
 from .forces import with_force
 
+DIRECTION = "_direction"  # of a signal, -1 falling to 1 rising: turned by a travel, its `knee`
 PAD = 0.15  # of the range seen, by which the cosines' own period reaches beyond it: no slope is forced at its ends
 UNITS = {
     "current": "A", "current_rate": "A/s", "field": "A/m", "field_rate": "A/m/s", "magnetization": "A/m", "magnetization_rate": "A/m/s",
     "flux_rate": "T/s", "displacement": "m", "displacement_rate": "m/s", "stretch": "m", "reading": "reading", "reading_rate": "reading/s",
+    "magnetization_direction": "1", "displacement_direction": "1", "reading_direction": "1",
 }  # fmt: skip
 PLACES = {
     "source": ("current", "current_rate"),
-    "coil": ("flux_rate", "magnetization", "field"),
+    "coil": ("flux_rate", "magnetization", "field", "current"),
     "hysteresis": ("field", "magnetization", "field_rate"),
-    "magnetostriction": ("magnetization", "field", "magnetization_rate", "field_rate"),
-    "mechanics": ("displacement", "displacement_rate", "magnetization", "stretch"),
-    "sensor": ("reading", "reading_rate", "current", "current_rate", "magnetization", "flux_rate"),
+    "magnetostriction": ("magnetization", "field", "magnetization_rate", "field_rate", "magnetization_direction"),
+    "mechanics": ("displacement", "displacement_rate", "magnetization", "stretch", "displacement_direction"),
+    "sensor": ("reading", "reading_rate", "current", "current_rate", "magnetization", "flux_rate", "reading_direction"),
 }
 OUTPUTS = {"source": "A", "coil": "A/m", "hysteresis": "A/m", "magnetostriction": "m", "mechanics": "m", "sensor": "reading"}
+
+
+def is_reversible(place, variables) -> bool:
+    """Whether a term there is a magnetization of its own: a shift of the relays' field by the field alone would be another density."""
+    return place == "hysteresis" and tuple(variables) == ("field",)
+
+
+def direction_of(signal, travel, line):
+    """Which way a signal goes, -1 falling to 1 rising, (time,): after a turn it comes round by P. Dahl's law (AIAA J. 14 (1976) 1675)
+    within `travel`, however fast."""
+
+    def follow(state, now):
+        turned, before = state
+        moved = now - before
+        end = jnp.sign(moved)
+        turned = end + (turned - end) * jnp.exp(-jnp.abs(moved) / travel)
+        return (turned, now), turned
+
+    start = jnp.zeros_like(signal[0]), signal[0]
+    if line.periodic:
+        start, _ = jax.lax.scan(follow, start, signal)
+    return jax.lax.scan(follow, start, signal)[1]
 
 
 def _products(counts, along, xp):
@@ -80,11 +104,12 @@ class LearnedTerm(AbstractEffect):
     """What a block adds to its output: size * sum of coefficients * products of cosines in scaled variables.
 
     A variable x is scaled to s in 0..1 over the range seen, `low` to `high`, rates as arsinh(x / knee); the cosines are
-    cos(k pi (s + PAD)/(1 + 2 PAD)). A variable of one wave is a factor, x over its largest value: a loss per rate, a damping.
+    cos(k pi (s + PAD)/(1 + 2 PAD)). A variable of one wave is a factor, x over its largest value: a loss per rate, a damping,
+    a lag behind the way that a signal goes (`direction_of`).
     Beyond the range the function stays as at its edge, plus `beyond` times the scaled distance: zero, but uncertain.
     `deviation`: prior standard deviation of each coefficient, which falls with k as the spectrum of a smooth random
-    function. Added: to the current (A), to the loss or to the relays' field (A/m), to the free displacement (m), as a force
-    in metres of free displacement, or to the reading.
+    function. Added: to the current (A), to the loss or to the relays' field (A/m), a function of that field alone to the
+    magnetization (A/m), to the free displacement (m), as a force in metres of free displacement, or to the reading.
     """
 
     coefficients: tuple[Float[Array, ""], ...]
@@ -176,8 +201,18 @@ class LearnedTerm(AbstractEffect):
         series = _series(self.counts, jnp.stack(self.coefficients), tuple(along))
         return self.size * (series + sum(b * x for b, x in zip(self.beyond, outside, strict=True)))
 
-    def _of(self, table):
-        return self.value(*(table[v]() for v in self.variables))
+    @property
+    def reversible(self) -> bool:
+        """Whether it is a magnetization that the field has at once, beside the relays'."""
+        return is_reversible(self.place, self.variables)
+
+    def _of(self, table, line=None):
+        def at(name, knee):
+            if name.endswith(DIRECTION):
+                return direction_of(table[name.removesuffix(DIRECTION)](), knee, line)
+            return table[name]()
+
+        return self.value(*(at(v, knee) for v, knee in zip(self.variables, self.knee, strict=True)))
 
     def drive(self, current, line, actuator):
         """Current with the term, A."""
@@ -187,10 +222,17 @@ class LearnedTerm(AbstractEffect):
 
     def field_shift(self, trial, state, actuator):
         """Loss (coil) or shift of the relays' field (hysteresis), A/m."""
+        return jnp.zeros_like(trial.field) if self.reversible else self._of_trial(trial)
+
+    def magnetization(self, trial, state, actuator):
+        """What a reversible one adds to the relays' M, A/m."""
+        return self._of_trial(trial) if self.reversible else jnp.zeros_like(trial.field)
+
+    def _of_trial(self, trial):
         return self._of(
             {
                 "field": lambda: trial.field, "magnetization": lambda: trial.magnetization, "flux_rate": lambda: trial.flux_rate,
-                "field_rate": lambda: trial.field_rate,
+                "field_rate": lambda: trial.field_rate, "current": lambda: trial.current,
             }
         )  # fmt: skip
 
@@ -202,7 +244,8 @@ class LearnedTerm(AbstractEffect):
             {
                 "magnetization": lambda: magnetization, "field": lambda: field,
                 "magnetization_rate": lambda: line.derivative(magnetization), "field_rate": lambda: line.derivative(field),
-            }
+            },
+            line,
         )  # fmt: skip
 
     def displacement(self, displacement, free_displacement, signals, line, actuator):
@@ -216,7 +259,8 @@ class LearnedTerm(AbstractEffect):
                 {
                     "displacement": lambda: y, "displacement_rate": lambda: line.derivative(y), "magnetization": lambda: magnetization,
                     "stretch": lambda: y - free,
-                }
+                },
+                line,
             )  # fmt: skip
 
         return with_force(displacement, force, self, (signals["magnetization"], free_displacement), line, actuator, local=False)
@@ -231,5 +275,6 @@ class LearnedTerm(AbstractEffect):
                 "reading": lambda: reading, "reading_rate": lambda: line.derivative(reading), "current": lambda: current,
                 "current_rate": lambda: line.derivative(current), "magnetization": lambda: signals["magnetization"],
                 "flux_rate": lambda: line.derivative(signals["flux_density"]),
-            }
+            },
+            line,
         )  # fmt: skip

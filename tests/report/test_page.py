@@ -497,6 +497,10 @@ def test_a_learned_function_has_a_panel_for_each_value_of_its_second_variable():
         and ">added at the magnetostriction / µm</text>" in svg
     )
     assert svg.count(">magnetization / (kA/m)</text>") == 2
+    unknown |= {"variables": ["reading", "times_reading_direction"], "variable_units": ["m", "1"]}
+    unknown["function"]["slices"] = [{"at": a, **line} for a in (-1.0, 1.0)]
+    svg = learned_function(unknown).svg
+    assert ">reading falling</text>" in svg and ">reading rising</text>" in svg
 
 
 def test_what_says_nothing_is_not_drawn_and_columns_go_by_frequency(folders, tmp_path):

@@ -106,7 +106,10 @@ INNER = {
     "unknown.block": "block whose effects act most like the misfit",
     "unknown.region": "where in the drive or the variable it shows most",
     "unknown.explained_share": "share of the misfit that the nearest effect explains, 0 .. 1",
-    "unknown.variables": "local variables of which it acts as a function, `times_` before one that is a factor; block, region and what follows are there where a learned term is kept",
+    "unknown.variables": (
+        "local variables of which it acts as a function, `times_` before one that is a factor, `..._direction` the way that a signal goes, "
+        "-1 falling to 1 rising; block, region and what follows are there where a learned term is kept"
+    ),
     "unknown.variable_units": "their units",
     "unknown.unit": "unit of what the function adds at the block, or of the reading that alternates",
     "unknown.share": "share of the excess misfit that the learned term takes, 0 .. 1; of an alternation that of it which goes with the motion",
