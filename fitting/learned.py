@@ -32,6 +32,7 @@ CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 SMOOTH = 0.25  # of the range, over which a function bends that is fitted first far from the noise; and the share of the chi2 that it
 BENDS_MORE = 0.9  # leaves, of which one that bends as the evidence asks must leave less
+TRAVEL_STEPS, NEARER = (2.0, 1.3), 0.98  # by which the travel of a direction is changed, while so much of the chi2 is left
 KEPT = 0.8  # of the excess when recordings are left out may remain, else the term is not kept,
 HALF = 0.5  # nor where it takes less of the excess: what acts at a block is taken there, most of it
 UNSEEN = 0.03  # of what a recording alone shows: left out, it is taken to miss no more than what is left of it by this
@@ -92,7 +93,7 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
     no use, and foretells nothing; `choices`: of another density than the fit's.
 
     Far from the noise the evidence asks for a function that bends as the rest of the model is wrong: a smooth one is fitted first
-    there, and one that bends as it asks from where that ended.
+    there, and one that bends as it asks from where that ended. Of a direction, the travel is sought, too.
     """
     say = progress or (lambda *a: None)
     choices = choices or base.choices
@@ -100,8 +101,10 @@ def fit_term(base, place: Place, recordings, bench, progress=None, target: float
     steps = functools.partial(say, f"learning {place.joined(str)} at the {place.block}")
     far = base.chi2_per_sample > REFINE_BELOW
     found = _fitted(base, place.bent_over(max(place.length, SMOOTH)) if far else place, bench, steps, target, choices)
+    if place.turns:
+        found = _within_travel(found, base, bench, steps, target, choices)
     if found.place.length > place.length and found.chi2 < target:
-        finer = _fitted(base, place, bench, steps, target, choices, found)
+        finer = _fitted(base, found.place.bent_over(place.length), bench, steps, target, choices, found)
         found = finer if finer.chi2 < BENDS_MORE * found.chi2 else found
     problem, solution = found.problem, found.solution
     missed = solution.chi2 > target
@@ -164,6 +167,16 @@ def _fitted(base, place, bench, say, target, choices, before: _Fitted | None = N
             break
         term, values = dataclasses.replace(term, size=term.size * factor), values / factor
     return _Fitted(place, problem, solution, actuator, term.size, values, spread)
+
+
+def _within_travel(found: _Fitted, base, bench, say, target, choices) -> _Fitted:
+    """The same with directions that come round within the travel that leaves least: the evidence does not know it where the plain model
+    has bent to them."""
+    for factor in TRAVEL_STEPS:
+        for step in (factor, 1 / factor):
+            while (other := _fitted(base, found.place.turned_within(step), bench, say, target, choices, found)).chi2 < NEARER * found.chi2:
+                found = other
+    return found
 
 
 def chosen_places(places) -> list[Place]:

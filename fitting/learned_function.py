@@ -139,6 +139,7 @@ def described(learned: Learned) -> dict:
         "variables": named(learned.place), "variable_units": units, "unit": unit, "share": learned.share,
         "seen": [[float(a), float(b)] for a, b in zip(low, high, strict=True)], "rms": float(np.sqrt(np.mean(band(learned, *axes)[0] ** 2))),
         "mean_in": _taken_up(learned), "left_out": list(learned.left_out), "bends_over": learned.place.length,
+        "turns_within": float(term.knee[-1]) if learned.place.turns else None,
         "function": {"x": x.tolist(), "slices": slices},
         "boundaries": [
             {

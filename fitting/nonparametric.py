@@ -82,6 +82,16 @@ class Place:
         """The same place with a function that bends over another length."""
         return self if length == self.length else dataclasses.replace(self, length=length, term=_with_prior(self.term, length))
 
+    @property
+    def turns(self) -> bool:
+        """Whether the direction of a signal is among its variables."""
+        return any(v.endswith(DIRECTION) for v in self.variables)
+
+    def turned_within(self, factor: float) -> "Place":
+        """The same place with directions that come round within so many times the travel."""
+        knee = np.where([v.endswith(DIRECTION) for v in self.variables], factor, 1.0) * np.asarray(self.term.knee)
+        return dataclasses.replace(self, term=dataclasses.replace(self.term, knee=jnp.asarray(knee)))
+
     def joined(self, word) -> str:
         """The variables by `word(name)`: "a and b", or "a, times b" where b is a factor."""
         names = [word(v) for v in self.variables]
@@ -288,8 +298,8 @@ def locate_places(result, say=lambda *a: None) -> list[Place]:
     found = []
     for block, variables, tried in applicable_sets(tangents.actuator, tangents.signals, tangents.problem.quasistatic):
         say(f"a function of {' and '.join(variables)} at the {block}", 0, None)
-        turned = any(v.endswith(DIRECTION) for v in variables)
-        for counts, travel in itertools.product(tried, TRAVELS if turned else TRAVELS[:1]):
+        turns = any(v.endswith(DIRECTION) for v in variables)
+        for counts, travel in itertools.product(tried, TRAVELS if turns else TRAVELS[:1]):
             term = null_term(block, variables, tangents.signals, tangents.actuator, counts, travel)
             columns = tangents.columns(term)
             if not np.isfinite(columns).all():

@@ -23,6 +23,8 @@ def parts(unknown, sketch) -> list:
         ["rms over the range seen", _with_unit(unknown["rms"], unknown["unit"])],
         ["bends over", f"{percent(unknown['bends_over'])} of the range"],
     ]
+    if unknown.get("turns_within") is not None:
+        rows.append(["after a turn the direction comes round within", _with_unit(unknown["turns_within"], unknown["variable_units"][0])])
     text = (
         "It was fitted jointly with the density and all constants, held by the prior of a smooth random function, and is in the model of this "
         "folder as learned_term. It models what is missing; it does not say what it is. Beyond the range seen it stays as at its edge, and its "

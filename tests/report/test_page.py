@@ -601,7 +601,7 @@ def unknown_page(folders, tmp_path, boundaries):
     line = {"at": None, "value": [0.0, 2e-7], "low": [-1e-7, 1e-7], "high": [1e-7, 3e-7]}
     found["unknown"] |= {
         "block": "sensor", "variables": ["reading"], "variable_units": ["m"], "unit": "m", "share": 0.9, "seen": [[0.0, 1e-6]], "rms": 1e-7,
-        "left_out": [30.0, 13.0], "bends_over": 0.1, "function": {"x": [0.0, 1e-6], "slices": [line]}, "boundaries": boundaries,
+        "left_out": [30.0, 13.0], "bends_over": 0.1, "turns_within": 1.5e-8, "function": {"x": [0.0, 1e-6], "slices": [line]}, "boundaries": boundaries,
         "rivals": [{"block": "coil", "variables": ["field"]}],
     }  # fmt: skip
     found["repaired"] = found["base"]
@@ -621,6 +621,7 @@ def test_an_unknown_says_which_boundaries_were_tried_and_why_one_is_framed(folde
         boundary("coil", ["field"], 1.2, 13.5),
     ]
     page = unknown_page(folders, tmp_path, rows)
+    assert re.search(r"comes round within</th><td>0.015\sµm</td>", page)
     table = page.split("Where a smooth function would serve</caption>")[1].split("</table>")[0]
     said = [re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", row) for row in table.split("<tr>")[2:]]
     assert [row[-3:] for row in said] == [

@@ -117,6 +117,7 @@ INNER = {
     "unknown.rms": "rms of the function over the range seen, less its mean, or what `mean_in` takes up; of what alternates from period to period",
     "unknown.seen": "range of each variable in the recordings, [low, high]",
     "unknown.left_out": "chi2 per datum of recordings left out one at a time, [without, with the term]",
+    "unknown.turns_within": "travel of the signal within which its direction comes round after a turn (to 1/e of what is left); null where none is a variable",
     "unknown.bends_over": "length over which the function bends, share of the range seen",
     "unknown.function": "the function on a grid of the first variable, beyond the range seen on both sides",
     "unknown.function.x": "values of the first variable",
