@@ -173,7 +173,10 @@ def _within_travel(found: _Fitted, base, bench, say, target, choices) -> _Fitted
     """The same with directions that come round within the travel that leaves least: the evidence does not know it where the plain model
     has bent to them."""
     for factor in TRAVEL_STEPS:
+        before = found
         for step in (factor, 1 / factor):
+            if found is not before:
+                break  # what lies the other way has been tried
             while (other := _fitted(base, found.place.turned_within(step), bench, say, target, choices, found)).chi2 < NEARER * found.chi2:
                 found = other
     return found
@@ -244,9 +247,12 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
         return any(t.worth for t in tried)
 
     served, far = try_all(chosen_places(places)), base.chi2_per_sample > REFINE_BELOW
-    for others in (other_places, *[plain_places] * far) if target == np.inf else ():
-        met = any(t.result.chi2_per_sample < MET for t in tried)
-        if not served or (far and not met):
+
+    def to_go_on():
+        return target == np.inf and not (served and (not far or any(t.result.chi2_per_sample < MET for t in tried)))
+
+    for others in (other_places, plain_places) if far else (other_places,):
+        if to_go_on():
             served = try_all(others(places, [t.place for t in tried]))
     if not served:
         return None

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from magjax.effects.learned_term import DIRECTION, OUTPUTS, UNITS
+from magjax.effects.learned_term import OUTPUTS, UNITS, turning
 from magjax.programs import kept
 from magjax.simulate import run_chain
 
@@ -83,7 +83,7 @@ def _levels(term) -> list:
     """Values of the second variable at which a function is shown, [None] where it has none."""
     if len(term.variables) == 1:
         return [None]
-    shares = (0.0, 1.0) if term.variables[1].endswith(DIRECTION) else (0.1, 0.5, 0.9)
+    shares = (0.0, 1.0) if turning(term.variables)[1] else (0.1, 0.5, 0.9)
     return [float(term.low[1] + s * (term.high[1] - term.low[1])) for s in shares]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from magjax.chain import Timeline
 from magjax.constants import MU0
-from magjax.effects.learned_term import DIRECTION, PAD, LearnedTerm, direction_of, is_reversible
+from magjax.effects.learned_term import DIRECTION, PAD, LearnedTerm, direction_of, is_reversible, turning
 from magjax.programs import kept
 from magjax.simulate import driven_current, finish_chain, march_chain
 
@@ -85,11 +85,11 @@ class Place:
     @property
     def turns(self) -> bool:
         """Whether the direction of a signal is among its variables."""
-        return any(v.endswith(DIRECTION) for v in self.variables)
+        return any(turning(self.variables))
 
     def turned_within(self, factor: float) -> "Place":
         """The same place with directions that come round within so many times the travel."""
-        knee = np.where([v.endswith(DIRECTION) for v in self.variables], factor, 1.0) * np.asarray(self.term.knee)
+        knee = np.where(turning(self.variables), factor, 1.0) * np.asarray(self.term.knee)
         return dataclasses.replace(self, term=dataclasses.replace(self.term, knee=jnp.asarray(knee)))
 
     def joined(self, word) -> str:
@@ -168,9 +168,9 @@ def null_term(block, variables, signals, actuator, counts, travel: float = TRAVE
 
 def _range_of(variable, signals, travel):
     """(lowest, highest) and the knee of a variable."""
-    if variable.endswith(DIRECTION):
-        return (-1.0, 1.0), travel * np.ptp(signals[variable.removesuffix(DIRECTION)])
-    x = signals[variable]
+    x = signals[variable.removesuffix(DIRECTION)]
+    if any(turning((variable,))):
+        return (-1.0, 1.0), travel * np.ptp(x)
     return (x.min(), x.max()), KNEE * np.abs(x).max() if variable.endswith("_rate") else 0.0
 
 
@@ -233,12 +233,9 @@ class Tangents:
         return self.problem.passes.change(lines).T
 
     def _waves(self, term, signals):
-        def at(name, knee):
-            if name.endswith(DIRECTION):
-                return np.asarray(_directions(signals[name.removesuffix(DIRECTION)], knee))
-            return signals[name]
-
-        return term.basis(*(at(v, knee) for v, knee in zip(term.variables, term.knee, strict=True)), xp=np)[0]
+        own = [signals[v.removesuffix(DIRECTION)] for v in term.variables]
+        turned = zip(own, term.knee, turning(term.variables), strict=True)
+        return term.basis(*(np.asarray(_directions(x, travel)) if turns else x for x, travel, turns in turned), xp=np)[0]
 
     def project(self, columns) -> np.ndarray:
         """The part of data columns that the fit cannot make."""
@@ -298,8 +295,7 @@ def locate_places(result, say=lambda *a: None) -> list[Place]:
     found = []
     for block, variables, tried in applicable_sets(tangents.actuator, tangents.signals, tangents.problem.quasistatic):
         say(f"a function of {' and '.join(variables)} at the {block}", 0, None)
-        turns = any(v.endswith(DIRECTION) for v in variables)
-        for counts, travel in itertools.product(tried, TRAVELS if turns else TRAVELS[:1]):
+        for counts, travel in itertools.product(tried, TRAVELS if any(turning(variables)) else TRAVELS[:1]):
             term = null_term(block, variables, tangents.signals, tangents.actuator, counts, travel)
             columns = tangents.columns(term)
             if not np.isfinite(columns).all():

@@ -40,6 +40,11 @@ def is_reversible(place, variables) -> bool:
     return place == "hysteresis" and tuple(variables) == ("field",)
 
 
+def turning(variables) -> tuple[bool, ...]:
+    """Which of some variables are the directions of a signal."""
+    return tuple(v.endswith(DIRECTION) for v in variables)
+
+
 def direction_of(signal, travel, line):
     """Which way a signal goes, -1 falling to 1 rising, (time,): after a turn it comes round by P. Dahl's law (AIAA J. 14 (1976) 1675)
     within `travel`, however fast."""
@@ -207,12 +212,9 @@ class LearnedTerm(AbstractEffect):
         return is_reversible(self.place, self.variables)
 
     def _of(self, table, line=None):
-        def at(name, knee):
-            if name.endswith(DIRECTION):
-                return direction_of(table[name.removesuffix(DIRECTION)](), knee, line)
-            return table[name]()
-
-        return self.value(*(at(v, knee) for v, knee in zip(self.variables, self.knee, strict=True)))
+        signals = [table[v.removesuffix(DIRECTION)]() for v in self.variables]
+        turned = zip(signals, self.knee, turning(self.variables), strict=True)
+        return self.value(*(direction_of(x, travel, line) if turns else x for x, travel, turns in turned))
 
     def drive(self, current, line, actuator):
         """Current with the term, A."""
