@@ -81,6 +81,17 @@ def test_it_is_not_screened():
     assert LearnedTerm not in CATALOGUE and LearnedTerm.name not in {k.name for k in CATALOGUE}
 
 
+def test_a_learned_spring_stiffer_than_the_rod_is_solved_under_a_drive_that_does_not_repeat():
+    """Its last period is that of the steady state: sample by sample, for a fixed point swings up there."""
+    term = LearnedTerm.null("mechanics", ("displacement",), [0.0], [5e-5], (4,), np.ones(4), 3e-5, coefficients=[0.0, 1.0, 0.0, 0.1])
+    act = actuator(20).with_effect(term)
+    steady = simulate(act, np.asarray(CURRENT), DT, periodic=True)
+    passing = simulate(act, np.tile(CURRENT, 4), DT)
+    swing = np.ptp(steady.displacement)
+    assert swing < 0.7 * np.ptp(steady.free_displacement)
+    assert np.abs(passing.displacement[-N:] - steady.displacement).max() < 5e-3 * swing
+
+
 def test_its_model_is_read_again_bit_for_bit(tmp_path):
     bench = load_bench("aa-050h")
     act = bench.actuator().with_effect(term_at("sensor")).replace({f"effects.learned_term.c{k}": 0.1 * k for k in range(12)})

@@ -265,7 +265,8 @@ class LearnedTerm(AbstractEffect):
                 line,
             )  # fmt: skip
 
-        return with_force(displacement, force, self, (signals["magnetization"], free_displacement), line, actuator, local=False)
+        local = not any(v.endswith("_rate") or turns for v, turns in zip(self.variables, turning(self.variables), strict=True))
+        return with_force(displacement, force, self, (signals["magnetization"], free_displacement), line, actuator, local)
 
     def reading(self, reading, signals, line, actuator):
         """Reading with the term."""
