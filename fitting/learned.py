@@ -28,6 +28,7 @@ from .uncertainty import WIDEN, covariance
 TRIED = 4  # leaders that are fitted jointly
 NEAR, NEAR_IF_SIMPLE = 0.9, 0.6  # share of the best evidence that makes another boundary worth a fit; a function of one variable there beside one of two
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
+ALL_BUT = 0.01  # of the excess, that a simple function may leave where, from far off, no others are sought: a kink between cosines leaves some
 CLOSE = 0.96
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 SMOOTH = 0.25  # of the range, over which a function bends that is fitted first far from the noise; and the share of the chi2 that it
@@ -227,7 +228,7 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
     """The term that serves best beside a fit, or None where none foretells left-out recordings better, or comes below the `target`.
 
     Far from the noise the evidence is no more than a hint, for the plain model has bent to what is missing: where none of its leaders
-    serves, or from far off none meets the noise, and there is no target, simple ones of the other blocks are tried, too, and then every
+    serves, or from far off none meets the noise or is a simple one that comes near it, and there is no target, simple ones of the other blocks are tried, too, and then every
     function of one variable; and the density may be finer beside the term.
     """
     say = progress or (lambda *a: None)
@@ -248,8 +249,12 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
 
     served, far = try_all(chosen_places(places)), base.chi2_per_sample > REFINE_BELOW
 
+    def meets(t):
+        left = t.result.chi2_per_sample
+        return left < MET or (t.worth and t.place.simple and left - 1 < ALL_BUT * (base.chi2_per_sample - 1))
+
     def to_go_on():
-        return target == np.inf and not (served and (not far or any(t.result.chi2_per_sample < MET for t in tried)))
+        return target == np.inf and not (served and (not far or any(meets(t) for t in tried)))
 
     for others in (other_places, plain_places) if far else (other_places,):
         if to_go_on():

@@ -388,6 +388,23 @@ def test_from_far_off_simple_functions_of_other_blocks_are_tried_where_none_meet
     assert learned_module.learn(types.SimpleNamespace(chi2_per_sample=base), (), None).place.block == found
 
 
+@pytest.mark.parametrize(("base", "others"), [(1380.0, []), (266.0, ["source"])])
+def test_from_far_off_a_simple_function_that_leaves_next_to_nothing_is_enough(monkeypatch, base, others):
+    """A stop stiffer than the rod: 1380 to 3.1, a kink between the cosines; fourteen functions of one variable that left 250 and more took four minutes."""
+    rod, source = placed("mechanics", ("displacement",), 1126.0), placed("source", ("current_rate",), 300.0)
+    fitted = []
+
+    def fit_term(base, place, *more, **how):
+        fitted.append(place.block)
+        return learned_of(place, 28.0 if place is rod else 90.0, 3.7 if place is rod else 250.0)
+
+    monkeypatch.setattr(learned_module, "locate_places", lambda *a: [rod, source])
+    monkeypatch.setattr(learned_module, "_on_finer_hats", lambda best, *a: best)
+    monkeypatch.setattr(learned_module, "fit_term", fit_term)
+    assert learned_module.learn(types.SimpleNamespace(chi2_per_sample=base), (), None).place is rod
+    assert fitted == ["mechanics", *others]
+
+
 def test_finer_hats_beside_a_term_must_take_half_of_what_is_left(monkeypatch):
     coil = placed("coil", ("flux_rate",), 768.0)
     monkeypatch.setattr(learned_module, "locate_places", lambda *a: [coil])
