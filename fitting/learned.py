@@ -217,10 +217,17 @@ def plain_places(places, tried) -> list[Place]:
     return [p for p in places if len(p.variables) == 1 and p.boundary not in had]
 
 
-def _needless(place, tried) -> bool:
-    """Whether one of those tried meets the noise and is as simple and far ahead to first order, or is simple in the same block."""
+def _nearly(t, base) -> bool:
+    """Whether a simple function that is worth it leaves next to nothing of what a fit leaves."""
+    return t.worth and t.place.simple and t.result.chi2_per_sample - 1 < ALL_BUT * (base.chi2_per_sample - 1)
+
+
+def _needless(place, tried, base) -> bool:
+    """Whether one of those tried meets the noise and is as simple and far ahead to first order, or is simple in the same block and
+    comes near it."""
     met = [t for t in tried if t.result.chi2_per_sample < MET and t.place.simple >= place.simple]
-    same = any(t.place.simple and t.place.block == place.block for t in met) and not place.simple
+    near = [t for t in tried if t in met or _nearly(t, base)]
+    same = any(t.place.simple and t.place.block == place.block for t in near) and not place.simple
     return same or any(place.evidence < CLOSE * t.place.evidence for t in met)
 
 
@@ -241,7 +248,7 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
     def try_all(chosen):
         with contextlib.suppress(Late):  # what was tried by then
             for place in chosen:
-                if not _needless(place, tried):
+                if not _needless(place, tried, base):
                     let_go()
                     tried.append(fit_term(base, place, recordings, bench, progress, target))
         tried.sort(key=lambda t: np.nan_to_num(t.left_out[1], nan=np.inf))
@@ -249,12 +256,8 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
 
     served, far = try_all(chosen_places(places)), base.chi2_per_sample > REFINE_BELOW
 
-    def meets(t):
-        left = t.result.chi2_per_sample
-        return left < MET or (t.worth and t.place.simple and left - 1 < ALL_BUT * (base.chi2_per_sample - 1))
-
     def to_go_on():
-        return target == np.inf and not (served and (not far or any(meets(t) for t in tried)))
+        return target == np.inf and not (served and (not far or any(t.result.chi2_per_sample < MET or _nearly(t, base) for t in tried)))
 
     for others in (other_places, plain_places) if far else (other_places,):
         if to_go_on():

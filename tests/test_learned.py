@@ -218,11 +218,16 @@ def test_simple_functions_are_tried_beside_the_best_of_their_block():
     assert chosen_places([both, other, place("sensor", "flux_rate", 950.0)]) == [both, other]
 
     def fitted(place, left):
-        return types.SimpleNamespace(place=place, result=types.SimpleNamespace(chi2_per_sample=left))
+        return types.SimpleNamespace(place=place, worth=True, result=types.SimpleNamespace(chi2_per_sample=left))
 
-    assert not _needless(both, [fitted(field, 9.0)]) and not _needless(loss, [fitted(field, 9.0)])
-    assert _needless(both, [fitted(field, 9.0), fitted(loss, 0.95)]) and not _needless(other, [fitted(loss, 0.95)])
-    assert _needless(other, [fitted(both, 0.95)]) and not _needless(loss, [fitted(both, 0.95)])  # one of two variables leaves the simple ones to try
+    def needless(one, tried, begins=266.0):
+        return _needless(one, tried, types.SimpleNamespace(chi2_per_sample=begins))
+
+    assert not needless(both, [fitted(field, 9.0)]) and not needless(loss, [fitted(field, 9.0)])
+    assert needless(both, [fitted(field, 9.0), fitted(loss, 0.95)]) and not needless(other, [fitted(loss, 0.95)])
+    assert needless(other, [fitted(both, 0.95)]) and not needless(loss, [fitted(both, 0.95)])  # one of two variables leaves the simple ones to try
+    # a simple one that leaves a hundredth spares those of two variables in its block, no others
+    assert needless(both, [fitted(loss, 3.1)], 1380.0) and not needless(other, [fitted(loss, 3.1)], 1380.0) and not needless(both, [fitted(loss, 4.1)])
 
 
 def test_evidence_knows_a_function_from_noise():
