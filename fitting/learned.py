@@ -235,8 +235,8 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
     """The term that serves best beside a fit, or None where none foretells left-out recordings better, or comes below the `target`.
 
     Far from the noise the evidence is no more than a hint, for the plain model has bent to what is missing: where none of its leaders
-    serves, or from far off none meets the noise or is a simple one that comes near it, and there is no target, simple ones of the other blocks are tried, too, and then every
-    function of one variable; and the density may be finer beside the term.
+    serves, or from far off none meets the noise or is a simple one that comes near it, and there is no target, simple ones of the other
+    blocks are tried, too, and then every function of one variable; and the density may be finer beside the term.
     """
     say = progress or (lambda *a: None)
     let_go()
@@ -257,7 +257,8 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
     served, far = try_all(chosen_places(places)), base.chi2_per_sample > REFINE_BELOW
 
     def to_go_on():
-        return target == np.inf and not (served and (not far or any(t.result.chi2_per_sample < MET or _nearly(t, base) for t in tried)))
+        near = any(t.result.chi2_per_sample < MET or _nearly(t, base) for t in tried)
+        return target == np.inf and not (served and (near or not far))
 
     for others in (other_places, plain_places) if far else (other_places,):
         if to_go_on():
