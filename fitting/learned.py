@@ -225,9 +225,9 @@ def _nearly(t, base) -> bool:
 def _needless(place, tried, base) -> bool:
     """Whether one of those tried meets the noise and is as simple and far ahead to first order, or is simple in the same block and
     comes near it."""
+    near = [t for t in tried if t.place.simple and (t.result.chi2_per_sample < MET or _nearly(t, base))]
+    same = any(t.place.block == place.block for t in near) and not place.simple
     met = [t for t in tried if t.result.chi2_per_sample < MET and t.place.simple >= place.simple]
-    near = [t for t in tried if t in met or _nearly(t, base)]
-    same = any(t.place.simple and t.place.block == place.block for t in near) and not place.simple
     return same or any(place.evidence < CLOSE * t.place.evidence for t in met)
 
 

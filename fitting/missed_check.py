@@ -13,7 +13,7 @@ from .task import Late
 from .verdict import WORSE
 
 MISSED = 5.0  # times its noise, by which a check recording is not foretold though the fit meets its own,
-GROSS = 0.1  # of its range, by which a check recording is missed that may be wrong itself
+GROSS, ODDS = 0.1, 3.0  # of its range, and times what the fit expects, by which a check recording is missed that may be wrong itself
 EXPECTED = 1.5  # beyond so many times what it expects for cells that no recording switched
 UNSEEN_TEXT = "Check recordings are missed, times their noise: {}; about as the fit expects, for they switch cells that no recording did."
 
@@ -56,7 +56,7 @@ def with_missed_check(task, found, check, anew) -> Diagnosis:
 
 def _contradiction(found, row, recording, bench) -> str | None:
     """What is wrong with a check recording that is missed grossly, in words; None where no one number mends it."""
-    if not row["rms_after"] > GROSS * np.ptp(recording.channels[bench.output]):
+    if not row["rms_after"] > max(GROSS * np.ptp(recording.channels[bench.output]), ODDS * (row.get("expected_rms") or 0.0)):
         return None
     return mended_by((found.repaired or found.base).actuator, recording, bench)
 

@@ -582,6 +582,38 @@ def test_a_damping_by_the_square_of_the_velocity_is_learned_from_far_off():
     assert abs(learned.result.estimate("coil.R_eddy").value / float(truth.coil.R_eddy) - 1) < 0.2 * wrong
 
 
+class StiffStop(AbstractEffect):
+    """A stop of three times the rod's stiffness: in no catalogue."""
+
+    name = "stiff_stop"
+    block = "mechanics"
+
+    def displacement(self, displacement, free_displacement, signals, line, actuator):
+        """Displacement under the stop, m; met at 33 um, of a free motion of 54 um."""
+        return with_force(displacement, lambda y, given, series: -3 * jnp.maximum(y - 33e-6, 0.0), self, (), line, actuator)
+
+    @classmethod
+    def parameters(cls):
+        return {}
+
+
+@pytest.mark.long
+def test_a_stop_stiffer_than_the_rod_is_learned_at_the_mechanics():
+    """It stalled at 18 and more; what is left is the kink, which falls between the cosines."""
+    from fitting.fit import fit
+    from fitting.learned import learn
+
+    bench = load_bench("aa-050h")
+    rng = np.random.default_rng(5)
+    drives = ((10, 0.8, 0.0), (20, 0.5, 0.1), (50, 0.8, 0.0), (80, 0.5, 0.1), (120, 0.8, 0.0), (160, 0.5, -0.1), (200, 0.8, 0.0), (250, 0.6, 0.0), (300, 0.7, 0.0))  # fmt: skip
+    runs = [record(concealed_actuator(bench, StiffStop()), *d, rng, f"r{d[0]}") for d in drives]
+    base = fit(runs, bench)
+    learned = learn(base, runs, bench)
+    print(f"\n{base.chi2_per_sample:.4g} to {learned.result.chi2_per_sample:.3g}: {learned.place.joined(str)} at the {learned.place.block}")
+    assert (learned.place.block, learned.place.variables) == ("mechanics", ("displacement",))
+    assert base.chi2_per_sample > 1000 and learned.result.chi2_per_sample < 4
+
+
 @pytest.mark.long
 def test_an_effect_outside_the_catalogue_is_placed_and_modelled(tmp_path):
     from fitting.diagnose import diagnose

@@ -157,3 +157,14 @@ def test_a_check_recording_that_is_missed_by_little_is_not_said_to_be_wrong(monk
     monkeypatch.setattr("fitting.missed_check.mended_by", lambda *a: "its reading is 1.02 times what they make of it")
     found = with_missed_check(Task((row,), BENCH), Diagnosis("nothing_missing", "All is well.", base=fitted, check=rows), [row], None)
     assert "contradicts" not in found.message and "80 Hz is missed by 10 times its noise" in found.message
+
+
+@pytest.mark.parametrize(("expected", "wrong"), [(7e-6, False), (3e-6, True)])
+def test_a_check_recording_that_is_missed_about_as_the_fit_expects_is_not_said_to_be_wrong(monkeypatch, expected, wrong):
+    """A loop of 1.3 um of a stroke of 47 lay 181 nm lower; the fit, which no recording had told the cells that it rests on, expected 120."""
+    row = record(TRUTH, 80, 0.5, 0.05, np.random.default_rng(3), "80 Hz")
+    fitted = dataclasses.make_dataclass("Fitted", ["actuator", "chi2_per_sample"])(TRUTH, 0.9)
+    missed = {"file": "80 Hz", "rms_before": 1.2e-5, "rms_after": 1.2e-5, "noise_rms": 5e-8, "beyond_plane": 0.0, "expected_rms": expected}
+    monkeypatch.setattr("fitting.missed_check.mended_by", lambda *a: "its zero has moved")
+    found = with_missed_check(Task((row,), BENCH), Diagnosis("nothing_missing", "All is well.", base=fitted, check=(missed,)), [row], None)
+    assert ("contradicts" in found.message) is wrong and ("80 Hz is missed by 240 times its noise" in found.message) is not wrong

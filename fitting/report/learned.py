@@ -83,7 +83,8 @@ def _boundaries(unknown):
     note = (
         "Evidence, share and visibility are to first order, before the joint fits. Evidence: natural logarithm of how much more probable the misfit "
         "is with a smooth function there than without. Visible: the part of it that density and constants cannot make. The best by evidence "
-        "(where none of them serves, or from far off none meets the noise, the simple ones of the other blocks, too, and from far off those of one variable) "
+        "(where none of them serves, or from far off none meets the noise nor, simple, comes near it, the simple ones of the other blocks, too, and "
+        "from far off those of one variable) "
         "were fitted jointly with all else on the plain model's density; what "
         "decides among these is the χ²/N of recordings left out one at a time, and of those that come near each other there, the simpler, then the more visible one. "
         "The one that was kept may then have been given a finer density."

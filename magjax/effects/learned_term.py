@@ -265,7 +265,7 @@ class LearnedTerm(AbstractEffect):
                 line,
             )  # fmt: skip
 
-        local = not any(v.endswith("_rate") or turns for v, turns in zip(self.variables, turning(self.variables), strict=True))
+        local = {"displacement", "magnetization", "stretch"}.issuperset(self.variables)
         return with_force(displacement, force, self, (signals["magnetization"], free_displacement), line, actuator, local)
 
     def reading(self, reading, signals, line, actuator):
