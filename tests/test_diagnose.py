@@ -72,6 +72,7 @@ def test_silent_where_nothing_is_missing(bench):
             "next_experiment", "placebo", "message", "base", "repaired", "ties"} == set(content)  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_model_offered_begins_where_the_check_recordings_say(bench, monkeypatch):
     def other(task, current, foretell):
         assert foretell and task.choices.rest == "auto"

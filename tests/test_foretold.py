@@ -86,6 +86,7 @@ def test_a_mean_that_is_not_held_against_anything_is_not_expected_to_be_missed(n
     assert all(n < b < 0.999 * a for a, b, n in zip(whole, shape, noise, strict=True))
 
 
+@pytest.mark.long
 def test_check_recordings_speak_for_what_is_there_and_not_for_what_is_not(bench, null, plain):
     effect = QuarticMagnetostriction()
     extra = ("effects.quartic_magnetostriction.b",)

@@ -50,6 +50,7 @@ def test_another_filter_takes_what_the_form_of_a_lag_leaves(posed):
     assert filter_takes(result) > 0.99 * left(result)
 
 
+@pytest.mark.long
 def test_no_filter_takes_what_a_strain_that_lags_behind_m_leaves(posed):
     """Its loop is as wide at 20 Hz as at 300."""
     problem, z, lines, _ = posed

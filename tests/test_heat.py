@@ -114,7 +114,8 @@ def test_heat_pulses_beside_what_else_is_missing(monkeypatch, z, rate, fall, lef
 
 @pytest.mark.parametrize(
     ("nodes", "taus"),
-    [(((4.2e-6, 1.0), (8e-7, 10.0)), (1.0, 10.0)), (((5e-6, 1.0),), (1.0,)), (((3.5e-6, 3.0),), (3.0,)), (((5e-6, 1.0), (2e-6, 10.0)), (1.0, 30.0))],
+    [(((4.2e-6, 1.0), (8e-7, 10.0)), (1.0, 10.0)), pytest.param(((5e-6, 1.0),), (1.0,), marks=pytest.mark.long),
+     pytest.param(((3.5e-6, 3.0),), (3.0,), marks=pytest.mark.long), (((5e-6, 1.0), (2e-6, 10.0)), (1.0, 30.0))],
     ids=["two nodes", "one", "one of the first times", "no drifts of their own"],
 )  # fmt: skip
 def test_heat_drifts_in_the_times_of_winding_and_rod(nodes, taus):

@@ -42,6 +42,7 @@ def test_nothing_scores_on_harmonics_of_the_mains_without_hum():
     assert z < 5 and len(tones) == 3
 
 
+@pytest.mark.long
 def test_hum_scores_on_the_harmonics_that_it_falls_on():
     base = fit(recorded(HUM), BENCH, refine=False)
     z, tones = hum_score(base.problem, base.refined)

@@ -197,6 +197,7 @@ def test_nor_does_its_screening(traced, monkeypatch):
     assert len(again[0][2]) > len(found[0][2])
 
 
+@pytest.mark.long
 def test_marches_of_many_periods_share_their_programs(traced):
     """How often a period is marched is no number for the compiler, and what is behind the march does not know it."""
     recordings = some(50, 200)

@@ -70,6 +70,7 @@ def test_what_is_left_must_count_beside_the_misfit(chi2, asked):
     assert periods_asked(problem([row], 3), None, chi2) == (asked,)
 
 
+@pytest.mark.long
 def test_recordings_of_different_periods_in_one_fit():
     """Each is predicted and differentiated as by itself, in the order that they came in."""
     bench, rng = load_bench("aa-050h"), np.random.default_rng(3)

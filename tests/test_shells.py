@@ -39,6 +39,7 @@ def test_the_matrix_is_that_of_a_cylinder():
         assert abs(found - whole) < miss * abs(1 - whole)
 
 
+@pytest.mark.long
 def test_four_depths_are_nearly_those_of_ten(monkeypatch):
     """Of a rod wholly of depths, where the skin leads most: four shells of equal area were 100 nm off."""
     act = actuator(20).replace({"coil.R_eddy": 18.5}).with_effect(effects.FieldDiffusion(kappa=1.0))

@@ -103,6 +103,7 @@ def test_a_drive_that_the_model_does_not_bear_is_refused_by_the_device(bench):
     assert ack.status and "outside the Preisach plane" in ack.text and not box.running and box.drive_now() == 0
 
 
+@pytest.mark.long
 def test_a_displacement_read_late(bench):
     prompt, late = (play(Device(BenchResponse(bench, {}, shift=s), noise=False), 0.4)[-WIDTH:] for s in (0.0, 5 / RATE))
     assert np.allclose(late[:, 0], prompt[:, 0]) and np.abs(late[:, 1] - np.roll(prompt[:, 1], 5)).max() < 4e-9

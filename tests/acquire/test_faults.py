@@ -77,8 +77,8 @@ def test_clean_run_over_a_pty_and_tcp(emulate, order):
 @pytest.mark.parametrize(
     "faults",
     [
-        *(pytest.param(one, marks=pytest.mark.long) for one in (("drop=2e-5",), ("flip=2e-5",))),
-        ("merge=0.02", "duplicate=0.05"), ("zeros=200000",), ("drop=3e-5", "flip=3e-5", "merge=0.01"),
+        *(pytest.param(one, marks=pytest.mark.long) for one in (("drop=2e-5",), ("flip=2e-5",), ("zeros=200000",))),
+        ("merge=0.02", "duplicate=0.05"), ("drop=3e-5", "flip=3e-5", "merge=0.01"),
     ],
 )
 def test_damage_on_the_line_is_counted_exactly(emulate, order, faults):
