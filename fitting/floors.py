@@ -14,6 +14,8 @@ from .record_level import drift_of
 from .spectra import fit_lines
 
 MISSED_SHARE = 0.4  # of a reading that changes sign in one recording alone: its rms about its mean that a fit of all misses
+OWN_LINE = 0.5  # of a reading's largest line, that the one at the drive's frequency must be to tell a sign
+NEXT = 3.0  # times the lowest frequency, up to which no reading may go with its drive where all signs are said to be swapped
 SWAPPED, ONE_SWAPPED = 20.0, 1e4  # chi2/N from which a sign may be swapped: in all recordings, in one (loops may turn about zero M)
 MOST = 0.8  # share of the recordings that must show it
 RESTLESS = 5.0  # mean square of the first period between its harmonics over the white noise
@@ -137,17 +139,24 @@ def _falls(blocks) -> bool:
     return bool(halves[0].mean() > FALLS * halves[1].mean())
 
 
+def _has_sign(s) -> bool:
+    """Whether the drive's own line is strong enough in a reading to say whether it goes with the drive or against it."""
+    return len(s.reading) > 1 and abs(s.drive[1]) > 0 and abs(s.reading[1]) > OWN_LINE * np.abs(s.reading[1:]).max()
+
+
 def swapped(spectra, fits=()) -> str | None:
-    """That the sign of a channel is swapped, in words: in all recordings, by the slowest, or in one that no faster one bears out.
+    """That the sign of a channel is swapped, in words: in all recordings, by the slowest, or in one that no faster one bears out; of
+    those in which the drive's own line says it, for about no M the strain goes by its square, at twice the drive's frequency.
 
     `fits`: the `RecordingFit` of each, where one alone may be: it must be missed by a part of itself, for about no field, where
     the strain goes by M^2, a reading may well move against the drive.
     """
-    lags = [-float(np.angle(s.reading[1] / s.drive[1])) if len(s.reading) > 1 and abs(s.drive[1]) > 0 else None for s in spectra]
+    lags = [-float(np.angle(s.reading[1] / s.drive[1])) if _has_sign(s) else None for s in spectra]
     known = [(s.frequency, lag) for s, lag in zip(spectra, lags, strict=True) if lag is not None]
     slowest = min((f for f, _ in known), default=0.0)
     slow = [lag for f, lag in known if f <= 1.01 * slowest]
-    if slow and all(abs(lag) > 0.75 * np.pi for lag in slow):
+    with_it = [f for f, lag in known if f < NEXT * slowest and -0.1 * np.pi < lag < 0.5 * np.pi]  # where M is of the other sign
+    if slow and all(abs(lag) > 0.75 * np.pi for lag in slow) and not with_it:
         return "the reading falls where the drive rises at the lowest frequency: the sign of a channel is swapped; set scale = -1 in [columns]"
     for s, lag, row in zip(spectra, lags, fits, strict=False):  # none, where one alone is not asked for
         if row.residual_rms < MISSED_SHARE * np.sqrt(2 * np.sum(np.abs(s.reading[1:]) ** 2)):

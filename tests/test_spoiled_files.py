@@ -117,6 +117,18 @@ def test_a_reading_that_follows_nothing_is_refused(tmp_path):
         spectra_of([good, lost], bench)
 
 
+@pytest.mark.parametrize(
+    ("own", "twice", "faster", "found"), [(-10e-6, 4e-6, -1, True), (-1e-6, 10e-6, 1, False), (-10e-6, 4e-6, 1, False), (-1e-6, 10e-6, -1, True)],
+    ids=["all", "about no M", "M of the other sign", "the next tells"],
+)  # fmt: skip
+def test_a_reading_against_its_drive_is_swapped_where_its_sign_can_be_told(tmp_path, own, twice, faster, found):
+    """A rod with friction whose M swung about zero read 0.6 um against its slowest drive, and 14 um at twice its frequency."""
+    bench, runs = load_bench("aa-050h"), []
+    for f, y in ((20, own * np.sin(PHASE - 0.2) + twice * np.sin(2 * PHASE)), (40, faster * 1e-5 * np.sin(PHASE - 0.4))):
+        runs.append(read(tmp_path, rows(columns=(TIME * F / f, CURRENT, 3e-5 + y + 3e-8 * NOISE)), f"r{f}.csv"))
+    assert (swapped(spectra_of(runs, bench)) is not None) is found
+
+
 def test_a_sign_that_is_swapped_in_one_recording_is_found(tmp_path):
     bench, runs = load_bench("aa-050h"), []
     for f, lag, sign in ((20, 0.2, 1), (100, 1.0, -1), (300, 2.2, 1)):
