@@ -45,7 +45,8 @@ from .verdict import Z_THRESHOLD, first_alone, unexplained, verdict, without_wor
 
 ABSORBED_VISIBILITY = 0.004
 LATE_TEXT = (
-    "The limit of {:g} min (--minutes of magjax diagnose; in its last two fifths nothing is begun anew) left out what was still to be tried; "
+    "The limit of {:g} min (--minutes of magjax diagnose; in its last two fifths nothing is begun anew, and the last is kept for a function "
+    "learned where effects explain too little) left out what was still to be tried; "
     "with more time it may find more, or rivals to what it names."
 )
 MEMORY_TEXT = "The recordings of the fit do not tell their start memory; the check recordings do: {}."
@@ -69,7 +70,8 @@ def diagnose(
     Recordings that hold the command beside a measured current, and `calibration`s of the sensor (reference displacement and
     reading), settle those instruments by themselves. `progress` is called as progress(text, step, chi2 per datum).
     `minutes`: after them, from the beginning, the search for effects ends with what it has found; the plain fit before it is
-    waited for, and from three fifths of the time on nothing is begun anew. `ended_after` of the diagnosis tells.
+    waited for; from three fifths of the time on nothing is begun anew, and the last is kept for a function learned where effects
+    explain too little. `ended_after` of the diagnosis tells.
     Returns a `Diagnosis`; raises `RecordingError` where a recording cannot be used at all and `ConfigurationError` for a wrong
     bench.
     """
@@ -166,7 +168,7 @@ def _explained(begun: Beginning) -> Diagnosis:
     place = where(plain, candidates, task.recordings, task.bench.output)
     checks = begun.check, remove_from_checks(begun.check, [e for e, _ in begun.adopted], task.bench)
     anew = Anew(begun, candidates, zero is not None)
-    reached = search(task.timed, plain, worth_a_search(plain, candidates), checks[1], anew, anew.means)
+    reached = search(task.searching, plain, worth_a_search(plain, candidates), checks[1], anew, anew.means)
     if anew.found:
         return _examined(anew.found)
     if before := _with_needed_means(begun, reached):

@@ -43,7 +43,8 @@ def _far_off(result, fewest: int) -> bool:
     return not float(np.sum(misfit**2)) < OFF * chi2_of(result)
 
 
-LATE = 0.6  # of the time, after which nothing is begun anew
+LATE = 0.6  # of the time, after which nothing is begun anew,
+SEARCHED = 0.8  # and the search for effects ends: a function is to be learned where they explain too little
 
 
 class Late(Exception):
@@ -51,15 +52,16 @@ class Late(Exception):
 
 
 class Clock:
-    """When a search ends, `minutes` from now, or never, and from when on it begins nothing anew; `cut`: whether anything was left
-    out for want of time."""
+    """When a diagnosis ends, `minutes` from now, or never, from when on it begins nothing anew, and when its search for effects ends;
+    `cut`: whether anything was left out for want of time."""
 
     def __init__(self, minutes: float = np.inf):
         now = time.monotonic()
-        self.end, self.late, self.cut = now + 60 * minutes, now + LATE * 60 * minutes, False
+        self.end, self.cut = now + 60 * minutes, False
+        self.late, self.searched = now + LATE * 60 * minutes, now + SEARCHED * 60 * minutes
 
     def check(self, end: float):
-        """Raise `Late` after a time, `end` or `late`."""
+        """Raise `Late` after a time, `end`, `late` or `searched`."""
         if time.monotonic() > end:
             self.cut = True
             raise Late
@@ -81,6 +83,11 @@ class Task:
     def timed(self):
         """The same, ended by its clock: what is to begin or goes on then raises `Late`."""
         return self._until(self.clock.end)
+
+    @property
+    def searching(self):
+        """The same, of the search for effects: ended while there is time to learn a function in their place."""
+        return self._until(self.clock.searched)
 
     @property
     def sparing(self):

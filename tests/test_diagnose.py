@@ -175,8 +175,10 @@ def test_names_a_concealed_sensor_filter(bench):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("ends", "said", "named"), [("at once", "unknown_at", []), ("after the leaders", "attributed", ["sensor_lag"])])
-def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, ends, said, named):
+@pytest.mark.parametrize(
+    ("ends", "at", "said", "named"), [("at once", 151.0, "unknown_at", []), ("at once", 121.0, "unknown_at", []), ("after the leaders", 121.0, "attributed", ["sensor_lag"])]
+)  # fmt: skip
+def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, ends, at, said, named):
     runs, checks = study(bench, SensorLag(tau=1e-4, order2=0.5))
     asked = {"sensor_lag", "transport_delay"}
     choices = Choices(without=tuple(e.name for e in CATALOGUE if e.name not in asked))
@@ -185,7 +187,7 @@ def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, 
     now, made = [0.0], getattr(place, part)
 
     def over(*arguments):
-        now[0] = 151.0
+        now[0] = at
         return made(*arguments)
 
     monkeypatch.setattr(task_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
@@ -194,7 +196,23 @@ def test_a_search_whose_time_is_over_says_what_it_had_found(bench, monkeypatch, 
     assert found.verdict == said and [e["name"] for e in found.effects] == named
     assert "limit of 2.5 min" in found.message and found.as_dict()["ended_after"] == 2.5
     assert all(e["confidence"] <= 0.5 for e in found.effects) and ("Not all rivals were fitted" in found.message) == bool(named)
-    assert found.base.converged and (found.repaired is not None) == bool(named)
+    learned = at < 150 and not named  # in the fifth of the time that is kept for it
+    assert found.base.converged and (found.repaired is not None) == bool(named or learned)
+    assert ("learned as one" in found.message) == learned
+
+
+@pytest.mark.parametrize(("share", "late"), [(0.5, []), (0.7, ["sparing"]), (0.85, ["sparing", "searching"]), (1.05, ["sparing", "searching", "timed"])])
+def test_a_fifth_of_the_time_is_kept_for_a_function_learned_in_place_of_effects(bench, monkeypatch, share, late):
+    now, ended = [0.0], []
+    monkeypatch.setattr(task_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    task = Task((), bench, clock=task_module.Clock(15))
+    now[0] = share * 900.0
+    for name in ("sparing", "searching", "timed"):
+        try:
+            getattr(task, name).say("the next")
+        except Late:
+            ended.append(name)
+    assert ended == late and task.clock.cut is bool(late)
 
 
 @pytest.mark.parametrize(

@@ -178,7 +178,7 @@ def run_diagnose(arguments) -> int:
     p.add_argument("--only", nargs="+", action="extend", default=[], metavar="EFFECT",
                    help="ask for these effects alone (`docs/effects.md` has the names); drift, heat and hum are told in any case")  # fmt: skip
     p.add_argument("--minutes", type=minutes, default=MINUTES,
-                   help=f"limit of the search for effects, from the start: then it ends with what it has found; inf: none (default {MINUTES:g})")  # fmt: skip
+                   help=f"limit, from the start: it ends with what it has found, the search for effects after four fifths; inf: none (default {MINUTES:g})")  # fmt: skip
     p.add_argument("--placebo", type=int, default=0, metavar="N",
                    help="search N simulations of the final model for what they do not lack: how often the search cries wolf (some seconds each, more where the screening alarms)")  # fmt: skip
     add_where(p, "the placebo's finished searches")
