@@ -18,7 +18,7 @@ from .attribute import excess_of
 from .finer import FINER_FROM, REFINE_BELOW, REFINE_BESIDE, finer_hats
 from .fit import finish
 from .joint import data_jacobian, data_residual, prior_matrix, solve
-from .nonparametric import FINE, ONE, Place, locate_places
+from .nonparametric import ONE, Place, locate_places
 from .plain import COARSE
 from .setup import build_problem
 from .task import Late
@@ -30,7 +30,6 @@ NEAR, NEAR_IF_SIMPLE = 0.9, 0.6  # share of the best evidence that makes another
 MET = 1.1  # chi2/N of a term beside which only places of nearly its evidence are tried
 ALL_BUT = 0.01  # of the excess, that a simple function may leave where, from far off, no others are sought: a kink between cosines leaves some
 CLOSE = 0.96
-SHARP = 0.015  # of the range, over which a function of the most cosines bends
 SIMPLER, SOME_WAY = 0.93, 0.4  # of the evidence is enough for one variable in place of two, or to be tried beside it
 SMOOTH = 0.25  # of the range, over which a function bends that is fitted first far from the noise; and the share of the chi2 that it
 BENDS_MORE = 0.9  # leaves, of which one that bends as the evidence asks must leave less
@@ -90,15 +89,15 @@ def left_out(problem, solution) -> np.ndarray:
     return np.asarray(rows)
 
 
-def fit_term(base, place: Place, recordings, bench, progress=None, target: float = np.inf, choices=None) -> Learned:
+def fit_term(base, place: Place, recordings, bench, progress=None, target: float = np.inf) -> Learned:
     """Fit a place's term jointly with density, parameters and adopted effects of a `FitResult`; `target`: a chi2 above which it is of
-    no use, and foretells nothing; `choices`: of another density than the fit's.
+    no use, and foretells nothing.
 
     Far from the noise the evidence asks for a function that bends as the rest of the model is wrong: a smooth one is fitted first
     there, and one that bends as it asks from where that ended. Of a direction, the travel is sought, too.
     """
     say = progress or (lambda *a: None)
-    choices = _fine_enough(choices or base.choices, place)
+    choices = _fine_enough(base.choices, place)
     steps = functools.partial(say, f"learning {place.joined(str)} at the {place.block}")
     far = base.chi2_per_sample > REFINE_BELOW
     found = _fitted(base, place.bent_over(max(place.length, SMOOTH)) if far else place, bench, steps, target, choices)
@@ -276,8 +275,7 @@ def learn(base, recordings, bench, progress=None, target: float = np.inf) -> Lea
     fits = tuple(
         (t.place, float(t.result.chi2_per_sample), float(t.left_out[1]) if np.isfinite(t.left_out[1]) else None) for t in tried
     )
-    if target == np.inf:
-        best = _on_finer_hats(_of_more_cosines(best, base, recordings, bench, progress), base, recordings, bench, progress)
+    best = best if target < np.inf else _on_finer_hats(best, base, recordings, bench, progress)
     return dataclasses.replace(best, places=tuple(places), rivals=rivals, tried=fits)
 
 
@@ -290,37 +288,24 @@ def _as_good(tried) -> list[Learned]:
     return sorted((t for t in worth if t.left_out[1] < near), key=lambda t: (not t.place.simple, -t.place.visibility))
 
 
-def _of_more_cosines(learned, base, recordings, bench, progress) -> Learned:
-    """The same function of `FINE` cosines, where they take half of what is left and foretell no worse: a kink falls between fewer."""
-    place, result = learned.place, learned.result
-    if not place.simple or place.term.counts[0] != ONE or not MET < result.chi2_per_sample < REFINE_BESIDE:
-        return learned
-    with contextlib.suppress(Late):
-        finer = place.of_cosines(FINE).bent_over(min(place.length, SHARP))
-        sharper = _from_there(learned, finer, base, recordings, bench, progress, result.choices)
-        if excess_of(sharper.result, 1.0) < COARSE * excess_of(result, 1.0) and sharper.left_out[1] <= learned.left_out[1]:
-            return sharper
-    return learned
-
-
 def _on_finer_hats(learned, base, recordings, bench, progress) -> Learned:
     """The same term beside finer and finer hats, as long as each takes half of what those before leave: the density was chosen
     without it. What it foretells of recordings left out is that of the first: finer cells are seen by one recording alone."""
     with contextlib.suppress(Late):
         while FINER_FROM[0] < learned.result.chi2_per_sample < REFINE_BESIDE and (choices := finer_hats(learned.result.choices)):
-            finer = _from_there(learned, learned.place, base, recordings, bench, progress, choices[0])
+            finer = _from_there(learned, base, recordings, bench, progress, choices[0])
             if not excess_of(finer.result, 1.0) < COARSE * excess_of(learned.result, 1.0):
                 break
             learned = dataclasses.replace(finer, left_out=learned.left_out)
     return learned
 
 
-def _from_there(learned, place, base, recordings, bench, progress, choices) -> Learned:
-    """The term of a place, of as many cosines or more or on another density, fitted from where a learned one ended."""
+def _from_there(learned, base, recordings, bench, progress, choices) -> Learned:
+    """The same term on another density, fitted from where it ended."""
     let_go()
+    result, term, place = learned.result, learned.term, learned.place
     steps = functools.partial(progress or (lambda *a: None), f"learning {place.joined(str)} at the {place.block}, finer")
-    result, term = learned.result, learned.term
-    values = np.pad([float(c) for c in term.coefficients], (0, len(place.term.coefficients) - len(term.coefficients)))
+    values = np.array([float(c) for c in term.coefficients])
     before = _Fitted(place, result.problem, result.solution, result.actuator, term.size, values, learned.covariance)
     choices = _fine_enough(choices, place)
     return _outcome(_fitted(base, place, bench, steps, np.inf, choices, before), base, recordings, bench, np.inf, choices)

@@ -24,7 +24,7 @@ from .adjoint import SIGNALS, as_lines
 from .screen import Projector
 
 ONE = 48  # cosines of a function of one variable
-FINE = 160  # where none of these serves: of one variable of the sensor or the strain, and of a learned one with a kink
+FINE = 160  # where none of these serves: of one variable of the sensor or the strain
 TWO = (10, 7)
 IN_STEP = (10, 6)  # inside the step every cosine costs in every iteration
 ADDED_TO = {"magnetostriction": "free displacement", "mechanics": "displacement", "sensor": "reading"}  # which of `SIGNALS`, at a place
@@ -81,13 +81,6 @@ class Place:
     def bent_over(self, length: float) -> "Place":
         """The same place with a function that bends over another length."""
         return self if length == self.length else dataclasses.replace(self, length=length, term=_with_prior(self.term, length))
-
-    def of_cosines(self, number: int) -> "Place":
-        """The same place with a function of so many cosines of its first variable, at null."""
-        counts, term = (number, *self.term.counts[1:]), self.term
-        low, high, knee, size = term.low, term.high, term.knee, term.size
-        finer = LearnedTerm.null(self.block, self.variables, low, high, counts, prior_deviations(counts, self.length), size, knee)
-        return dataclasses.replace(self, term=finer)
 
     @property
     def turns(self) -> bool:

@@ -369,7 +369,7 @@ def test_simple_functions_of_other_blocks_are_tried_where_no_leader_serves(monke
         return learned_of(place, outcome[place.block][1], outcome[place.block][0])
 
     monkeypatch.setattr(learned_module, "fit_term", fit_term)
-    monkeypatch.setattr(learned_module, "_from_there", lambda learned, place, *about: fit_term(None, place, (), None, choices=about[-1]))
+    monkeypatch.setattr(learned_module, "_from_there", lambda learned, *about: fit_term(None, learned.place, (), None, choices=about[-1]))
     monkeypatch.setattr(learned_module, "locate_places", lambda *a: [leads, both, alone, coil, rod, weak])
     found = learned_module.learn(FAR, (), None)
     assert found.place is coil and found.left_out == (266.0, 154.0)
@@ -419,23 +419,6 @@ def test_finer_hats_beside_a_term_must_take_half_of_what_is_left(monkeypatch):
     monkeypatch.setattr(learned_module, "_from_there", lambda *about: learned_of(coil, 154.0, *on[about[-1].knots]))
     found = learned_module.learn(FAR, (), None)
     assert found.result.choices.knots == (18, 13) and found.result.chi2_per_sample == 6.5
-
-
-@pytest.mark.parametrize(
-    ("counts", "leaves", "foretells", "taken"),
-    [((48,), 1.2, 30.0, True), ((48, 1), 1.2, 30.0, True), ((48,), 3.0, 30.0, False), ((48,), 1.2, 160.0, False), ((20,), 1.2, 30.0, False), ((10, 7), 1.2, 30.0, False)],
-    ids=["half and more", "of a factor", "less than half", "foretells worse", "inside the step", "of two variables"],
-)  # fmt: skip
-def test_a_kink_is_learned_by_more_cosines(monkeypatch, counts, leaves, foretells, taken):
-    """A stop of three times the rod's stiffness left 3.1 of 1381 to 48 of them."""
-    term = LearnedTerm.null("mechanics", ("displacement", "displacement_rate")[: len(counts)], *np.zeros((2, len(counts))), counts, np.ones(np.prod(counts)), 1.0)
-    rod, hats = Place("mechanics", term.variables, 768.0, 0.9, 0.1, 1.0, 0.4, term), (48, 32)
-    monkeypatch.setattr(learned_module, "locate_places", lambda *a: [rod])
-    monkeypatch.setattr(learned_module, "fit_term", lambda *a: learned_of(rod, 154.0, 5.0, hats))
-    monkeypatch.setattr(learned_module, "_from_there", lambda learned, place, *about: learned_of(place, foretells, leaves, hats))
-    place = learned_module.learn(FAR, (), None).place
-    assert place.term.counts == ((160, *counts[1:]) if taken else counts) and place.length == (0.015 if taken else 0.1)
-    assert len(place.term.coefficients) == len(place.term.deviation)
 
 
 @pytest.mark.parametrize(("leaves", "chosen"), [(100.0, "sensor"), (130.0, "sensor"), (160.0, "magnetostriction")])
@@ -622,7 +605,7 @@ class StiffStop(AbstractEffect):
 
 @pytest.mark.long
 def test_a_stop_stiffer_than_the_rod_is_learned_at_the_mechanics():
-    """It stalled at 18 and more, and 48 cosines, between which its kink falls, left 3.1."""
+    """It stalled at 18 and more; what is left is the kink, which falls between the cosines."""
     from fitting.fit import fit
     from fitting.learned import learn
 
@@ -634,7 +617,7 @@ def test_a_stop_stiffer_than_the_rod_is_learned_at_the_mechanics():
     learned = learn(base, runs, bench)
     print(f"\n{base.chi2_per_sample:.4g} to {learned.result.chi2_per_sample:.3g}: {learned.place.joined(str)} at the {learned.place.block}")
     assert (learned.place.block, learned.place.variables) == ("mechanics", ("displacement",))
-    assert base.chi2_per_sample > 1000 and learned.result.chi2_per_sample < 1.5
+    assert base.chi2_per_sample > 1000 and learned.result.chi2_per_sample < 4
 
 
 @pytest.mark.long
